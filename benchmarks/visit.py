@@ -22,7 +22,7 @@ from abcd_ns.engine.render import loss, make_rasterizer
 from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator

@@ -65,7 +65,7 @@ def parse(line: str) -> None:
     if words[0].startswith("--"):
         return
     command = cli.find_command(words[0])
-    if command.hands_on:
+    if command.passes_on:
         tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(Path(words[1])), *words[2:]])
         return
     tyro.cli(no_deed(command.load()), args=words[1:])

@@ -17,7 +17,7 @@ def completion(shell: Annotated[Literal["bash", "zsh"], tyro.conf.Positional] = 
     Args:
         shell: whose language the script is in.
     """
-    functions = {command.name: command.load() for command in cli.COMMANDS if not command.hands_on}
+    functions = {command.name: command.load() for command in cli.COMMANDS if not command.passes_on}
     tyro.extras.subcommand_cli_from_dict(
         functions, prog="abcd", args=["--tyro-print-completion", shell], sort_subcommands=False
     )

@@ -23,7 +23,7 @@ class Command(NamedTuple):
     name: str
     target: str
     help: str
-    hands_on: bool = False
+    passes_on: bool = False
     """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
@@ -45,7 +45,7 @@ COMMANDS = (
     Command("poses", "abcd_ns.cli.poses.command:poses", "find the camera poses of photos, by pycolmap"),
     Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
     Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
-    Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", hands_on=True),
+    Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", passes_on=True),
     Command("report", "abcd_ns.cli.report.command:report", "write an HTML page about a run"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as triangles"),
@@ -98,7 +98,7 @@ def find_command(name: str) -> Command:
 
 def run_command(command: Command, args: Sequence[str]) -> int:
     """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
-    if command.hands_on:
+    if command.passes_on:
         return command.load()(list(args))
     # Here and not above: `abcd --help` has no use for it.
     import tyro

@@ -1,4 +1,4 @@
 """Blocks trained at once, by workers in processes of their own, on this machine or others.
 
-`Dispatcher` lends blocks and takes back what became of them; forked processes' pipes or Ray carry both.
+`Dispatcher` assigns blocks and takes back what became of them; forked processes' pipes or Ray carry both.
 """

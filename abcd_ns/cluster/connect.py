@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from abcd_ns.cluster.lease import WorkersError
+from abcd_ns.cluster.assignment import WorkersError
 from abcd_ns.errors import first_line
 
 LOOPBACK = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""Trains blocks at once: lends them to workers, and takes in what they made of them in a planned order.
+"""Trains blocks at once: assigns them to workers, and takes in what they made of them in a planned order.
 
 `lag` visits are out. They are taken in one after the other, as they would end if all steps took equally long,
 and whenever one is, the next begins from what is there by then. Whoever is done sooner waits for its turn. So
@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from abcd_ns.cluster.lease import (
+from abcd_ns.cluster.assignment import (
+    Assignment,
     Finished,
-    Lease,
     Lost,
     Report,
     StepsSeen,
@@ -28,9 +28,9 @@ from abcd_ns.cluster.lease import (
     WorkersError,
 )
 from abcd_ns.cluster.shared_residual import shown_beside
-from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, WorkerLost, WorkersSeen
-from abcd_ns.engine.store.lent_scene import Outlines
-from abcd_ns.engine.store.settle import has_scaffold, settle, with_mail
+from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
+from abcd_ns.engine.store.assigned_scene import Outlines
+from abcd_ns.engine.store.commit import commit, has_coarse_model, with_pending
 from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.layer_source import LayerSource
@@ -49,11 +49,11 @@ LOSSES = 5
 
 
 @dataclass
-class Lent:
+class InFlight:
     """A visit that was begun and is not taken in yet."""
 
     active: ActiveVisit
-    lease: Lease
+    assignment: Assignment
     taken: int
     """Gaussians that waited for the block and are in its visit."""
     ends: int
@@ -64,7 +64,7 @@ class Lent:
 
 
 class Dispatcher(Coordinator):
-    """Lends blocks to workers; what cannot be lent, the warm-up, it trains as a coordinator does.
+    """Assigns blocks to workers; what cannot be assigned, the warm-up, it trains as a coordinator does.
 
     Args:
         lag: see above; None takes SLACK for each worker. Fewer where there are fewer blocks.
@@ -81,7 +81,7 @@ class Dispatcher(Coordinator):
     ) -> None:
         super().__init__(run, source=source, target=target)
         self.workers, self._lag = workers, lag or SLACK * workers.count
-        self._lent: list[Lent] = []
+        self._in_flight: list[InFlight] = []
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
         self._numbers, self._ended = itertools.count(1), 0
         self._counted = self.state.step
@@ -92,7 +92,7 @@ class Dispatcher(Coordinator):
     def trains_elsewhere(self) -> bool:
         """Once the warm-up, or a visit that was saved in its midst, is over."""
         state = self.state
-        warms_up = state.visit == 0 and has_scaffold(self.scene) and self.progress < self.config.warmup
+        warms_up = state.visit == 0 and has_coarse_model(self.scene) and self.progress < self.config.warmup
         return state.active is None and not warms_up
 
     def await_step(self) -> None:
@@ -106,7 +106,7 @@ class Dispatcher(Coordinator):
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
             self.resume()  # a listener may have paused it
-            self._lend()
+            self._assign()
             if self._counted < self.state.step or self.finished:
                 break
             for report in self.workers.wait(SECONDS):
@@ -116,17 +116,17 @@ class Dispatcher(Coordinator):
 
     @property
     def finished(self) -> bool:
-        """Whether the budget is used up, and all that was lent is taken in."""
-        return not self._lent and super().finished
+        """Whether the budget is used up, and all that was assigned is taken in."""
+        return not self._in_flight and super().finished
 
     def pause(self) -> None:
         """No time counts until the next step, nor does anyone train, unless workers cannot be held."""
-        if not self._lent or self.workers.hold():
+        if not self._in_flight or self.workers.hold():
             super().pause()
 
     def resume(self) -> None:
         """Time counts again, and workers go on."""
-        self.workers.go_on()
+        self.workers.resume()
         super().resume()
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
@@ -136,12 +136,12 @@ class Dispatcher(Coordinator):
 
     # -- lending -------------------------------------------------------------------------------------
 
-    def _lend(self) -> None:
+    def _assign(self) -> None:
         """Take in what may be, and lend as much as workers can take."""
         self._submit()
         steps = self.run.budget.steps
         while self.progress < 1.0 and (steps is None or self.state.planned < steps):
-            if len(self._lent) >= self._lag:
+            if len(self._in_flight) >= self._lag:
                 if not self._take_in_first():
                     return
             elif self.workers.idle == 0:
@@ -153,15 +153,15 @@ class Dispatcher(Coordinator):
                     if not self._take_in_first():
                         return
                     continue
-                self._lent.append(self._lent_of(active))
+                self._in_flight.append(self._in_flight_of(active))
                 self._submit()
-        while self._lent and self._take_in_first():
+        while self._in_flight and self._take_in_first():
             pass
 
-    def _lent_of(self, active: ActiveVisit) -> Lent:
+    def _in_flight_of(self, active: ActiveVisit) -> InFlight:
         state, scene, block, light = self.state, self.scene, active.geometry.block, self.run.light
         blocks = range(scene.tree.num_blocks)
-        mail = scene.mail(block)
+        migrants = scene.pending_for(block)
         task = VisitTask(
             active=active,
             tree=scene.tree,
@@ -177,12 +177,14 @@ class Dispatcher(Coordinator):
         )
         state.active = None
         state.in_flight.append(active)
-        own = self.workers.share(with_mail(scene, block))
-        lease = Lease(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
-        return Lent(active, lease, len(mail or ()), self._ended + active.steps * max(active.batch, 1))
+        own = self.workers.share(with_pending(scene, block))
+        assignment = Assignment(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
+        return InFlight(
+            active, assignment, len(migrants or ()), self._ended + active.steps * max(active.batch, 1)
+        )
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
-        """What reads a block as it is now; what was shared before stays with the leases that have it."""
+        """What reads a block as it is now; what was shared before stays with the assignments that have it."""
         version = self.scene.version(block)
         if block not in self._shown or self._shown[block][0] != version:
             self._shown[block] = version, self.workers.share(self.scene.gaussians(block))
@@ -191,7 +193,7 @@ class Dispatcher(Coordinator):
     def _beside(self, active: ActiveVisit) -> dict[int, float]:
         """By view, which part of the other blocks' weight is out at the same time: begun before, or next."""
         state, block = self.state, active.geometry.block
-        others = {lent.active.geometry.block for lent in self._lent}
+        others = {visit.active.geometry.block for visit in self._in_flight}
         others |= {plan.block for plan in state.queue[: self._lag - 1]}
         blocks = self.scene.tree.num_blocks
         return shown_beside(state.influence, block, others - {block}, blocks, active.views)
@@ -201,85 +203,89 @@ class Dispatcher(Coordinator):
         limit = self.config.density.limit
         if limit is None:
             return None
-        given = sum(lent.lease.task.allowance for lent in self._lent)
-        return max(limit - self.count() - given, 0) // max(self._lag - len(self._lent), 1)
+        given = sum(visit.assignment.task.allowance for visit in self._in_flight)
+        return max(limit - self.count() - given, 0) // max(self._lag - len(self._in_flight), 1)
 
     def _submit(self) -> None:
-        for lent in self._lent:
-            if not lent.submitted and self.workers.idle:
-                now = replace(lent.lease.task, seconds=self.stopwatch.seconds)  # it may have waited for long
-                lent.lease = replace(lent.lease, task=now)
-                self.workers.submit(lent.lease)
-                lent.submitted, active, block = True, lent.active, lent.active.geometry.block
-                if not lent.losses:
+        for visit in self._in_flight:
+            if not visit.submitted and self.workers.idle:
+                now = replace(
+                    visit.assignment.task, seconds=self.stopwatch.seconds
+                )  # it may have waited for long
+                visit.assignment = replace(visit.assignment, task=now)
+                self.workers.submit(visit.assignment)
+                visit.submitted, active, block = True, visit.active, visit.active.geometry.block
+                if not visit.losses:
                     seen, gaussians = len(active.trained_on), now.outlines.counts[block]
                     self.announce(VisitBegan(active.number, now.sweep, block, active.steps, seen, gaussians))
 
     # -- taking in -----------------------------------------------------------------------------------
 
     def _hear(self, report: Report) -> None:
-        lent = next((lent for lent in self._lent if lent.lease.number == report.lease), None)
-        if lent is None or lent.outcome is not None:  # its lease was given up
+        visit = next(
+            (visit for visit in self._in_flight if visit.assignment.number == report.assignment), None
+        )
+        if visit is None or visit.outcome is not None:  # its assignment was given up
             return
         match report:
             case StepsSeen():
-                number = lent.active.number
+                number = visit.active.number
                 self.announce(StepTaken(self.state.step, number, report.done, report.psnr))
             case Finished():
-                lent.outcome = report.outcome
+                visit.outcome = report.outcome
             case Lost():
-                self._lose(lent, report.why)
+                self._lose(visit, report.why)
 
-    def _lose(self, lent: Lent, why: str) -> None:
-        lent.losses += 1
-        self.announce(WorkerLost(block := lent.active.geometry.block, why))
-        if lent.losses >= LOSSES:
+    def _lose(self, visit: InFlight, why: str) -> None:
+        visit.losses += 1
+        self.announce(WorkerLost(block := visit.active.geometry.block, why))
+        if visit.losses >= LOSSES:
             raise WorkersError(
                 f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. What other "
                 "visits did is safe: free memory (abcd plan says what a block needs) and resume."
             )
-        lent.lease, lent.submitted = replace(lent.lease, number=next(self._numbers)), False
+        visit.assignment, visit.submitted = replace(visit.assignment, number=next(self._numbers)), False
 
     def _take_in_first(self) -> bool:
         """Take in the visit that is to end first, if it is done; whether it was."""
-        lent = min(self._lent, key=lambda lent: lent.ends)
-        if lent.outcome is None:
+        visit = min(self._in_flight, key=lambda visit: visit.ends)
+        if visit.outcome is None:
             return False
-        self._lent.remove(lent)
-        self._ended = lent.ends
-        outcome, active, state = lent.outcome, lent.active, self.state
-        block, sweep = active.geometry.block, lent.lease.task.sweep
+        self._in_flight.remove(visit)
+        self._ended = visit.ends
+        outcome, active, state = visit.outcome, visit.active, self.state
+        block, sweep = active.geometry.block, visit.assignment.task.sweep
         state.in_flight.remove(active)
         state.step += outcome.done
         if outcome.shown:
             state.influence[block].update(outcome.shown)
         state.health[block] = outcome.health
         active.layer_seconds = outcome.layer_seconds
-        updates = settle(self.scene, block, outcome.state, self.config.recipe.migrate, lent.taken)
+        updates = commit(self.scene, block, outcome.state, self.config.recipe.migrate, visit.taken)
         rest_after_visit(self.run, active, outcome.state, updates, sweep)
         queued = state.sweep == sweep and state.queue
-        if not queued and all(other.lease.task.sweep != sweep for other in self._lent):
-            self.announce(SweepEnded(sweep, state.step))
+        if not queued and all(other.assignment.task.sweep != sweep for other in self._in_flight):
+            self.announce(EpochEnded(sweep, state.step))
         return True
 
     # -- at rest -------------------------------------------------------------------------------------
 
     def restore(self) -> None:
         """As the coordinator's; what workers are at is dropped, and planned again."""
-        self._lent.clear()
+        self._in_flight.clear()
         super().restore()
         self._counted = self.state.step
 
     def await_visits(self) -> bool:
         # What no worker has, or has lost, is planned again when the run resumes.
-        self._lent = [lent for lent in self._lent if lent.submitted]
-        waits = bool(self._lent)
-        while self._lent:
+        self._in_flight = [visit for visit in self._in_flight if visit.submitted]
+        waits = bool(self._in_flight)
+        while self._in_flight:
             self.resume()
             for report in self.workers.wait(SECONDS):
                 self._hear(report)
-            self._lent = [lent for lent in self._lent if lent.submitted]
-            while self._lent and self._take_in_first():
+            self._in_flight = [visit for visit in self._in_flight if visit.submitted]
+            while self._in_flight and self._take_in_first():
                 pass
         return waits
 

@@ -21,9 +21,9 @@ from typing import Any, NoReturn
 
 import torch
 
-from abcd_ns.cluster.lease import (
+from abcd_ns.cluster.assignment import (
+    Assignment,
     Finished,
-    Lease,
     Lost,
     Member,
     Parcel,
@@ -55,8 +55,8 @@ def can_fork(device: torch.device) -> bool:
 
 
 def last_words(error: Exception) -> WorkersError | MemoryError:
-    """Of a worker: MemoryError where another may do better; what the user can mend as it is; of all else, one
-    line of the traceback's end."""
+    """Of a worker: MemoryError where another may do better; what the user can repair as it is; of all else,
+    one line of the traceback's end."""
     if isinstance(error, UserError):
         return WorkersError(str(error))
     if is_out_of_memory(error):
@@ -98,16 +98,16 @@ class ForkedWorkers(Workers[Place]):
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         return lambda: value  # a fork has it, too, and what is at rest never changes
 
-    def submit(self, lease: Lease) -> None:
+    def submit(self, assignment: Assignment) -> None:
         member = self._longest_idle()
-        member.take(lease)
+        member.take(assignment)
         member.heard, member.lives = time.monotonic(), False
         member.pipe, theirs = Pipe()
         member.pid = os.fork()
         if member.pid == 0:
             member.pipe.close()
-            visit, task = self._worker.visit, lease.task
-            _live(theirs, lambda tell: visit(task, lease.state(), lease.drawn, tell, self._clock))
+            visit, task = self._worker.visit, assignment.task
+            _live(theirs, lambda tell: visit(task, assignment.state(), assignment.drawn, tell, self._clock))
         theirs.close()
 
     def _clock(self) -> float:
@@ -116,13 +116,13 @@ class ForkedWorkers(Workers[Place]):
     def hold(self) -> bool:
         if self._held_since is None:
             for member in self._members:
-                if member.lease is not None and not member.lives:
+                if member.assignment is not None and not member.lives:
                     member.pipe.poll(FIRST_WORD)
             self._held_since = time.perf_counter()
             self._signal(signal.SIGSTOP)
         return True
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         if self._held_since is None:
             return
         held, self._held_since = time.perf_counter() - self._held_since, None
@@ -137,16 +137,16 @@ class ForkedWorkers(Workers[Place]):
                 os.kill(pid, number)
 
     def wait(self, seconds: float) -> list[Report]:
-        busy = {member.pipe: member for member in self._members if member.lease is not None}
+        busy = {member.pipe: member for member in self._members if member.assignment is not None}
         reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
         for member in self._members:
-            if member.lease is not None and time.monotonic() - member.heard > SILENCE:
+            if member.assignment is not None and time.monotonic() - member.heard > SILENCE:
                 reports.append(self._lose(member, f"silent for {SILENCE:.0f} s"))
         return reports
 
     def close(self) -> None:
         for member in self._members:
-            if member.lease is not None:
+            if member.assignment is not None:
                 self._end(member)
 
     def _hear(self, member: Place) -> list[Report]:
@@ -160,7 +160,7 @@ class ForkedWorkers(Workers[Place]):
                 return []
             case (int(done), float(psnr)):
                 member.done = done
-                return [StepsSeen(member.lease.number, done, psnr)]
+                return [StepsSeen(member.assignment.number, done, psnr)]
             case Parcel():
                 member.visits += 1
                 return [Finished(self._end(member).number, said.opened())]
@@ -173,16 +173,16 @@ class ForkedWorkers(Workers[Place]):
         member.deaths += 1
         return Lost(self._end(member).number, why)
 
-    def _end(self, member: Place) -> Lease:
+    def _end(self, member: Place) -> Assignment:
         """Its process is no more, and it is idle."""
-        lease = member.put_down()
+        assignment = member.put_down()
         member.pipe.close()
         if os.getpid() == self._owner:  # a process that was forked meanwhile knows it, too
             with suppress(ProcessLookupError):
                 os.kill(member.pid, signal.SIGKILL)
             with suppress(ChildProcessError):
                 os.waitpid(member.pid, 0)
-        return lease
+        return assignment
 
 
 class _Telling:

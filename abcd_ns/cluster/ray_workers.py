@@ -18,9 +18,9 @@ from ray import cloudpickle
 from ray import exceptions as of_ray
 
 from abcd_ns import __version__
-from abcd_ns.cluster.lease import (
+from abcd_ns.cluster.assignment import (
+    Assignment,
     Finished,
-    Lease,
     Lost,
     Member,
     Parcel,
@@ -142,11 +142,11 @@ class RayWorkers(Workers[Remote]):
 
     share = staticmethod(Shared.of)
 
-    def submit(self, lease: Lease) -> None:
+    def submit(self, assignment: Assignment) -> None:
         member = self._longest_idle()
-        member.take(lease)
+        member.take(assignment)
         member.asked_at = time.monotonic()
-        member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.drawn))
+        member.asked = member.actor.visit.remote(assignment.task, assignment.state, dict(assignment.drawn))
 
     def wait(self, seconds: float) -> list[Report]:
         self._ask()
@@ -181,14 +181,18 @@ class RayWorkers(Workers[Remote]):
     def _start(self, member: Remote) -> Remote:
         member.actor = self._class.remote()
         member.asked = member.actor.prepare.remote(_version(), self._make)
-        member.question, member.lease, member.ready = None, None, False
+        member.question, member.assignment, member.ready = None, None, False
         member.asked_at = member.free_since = time.monotonic()
         return member
 
     def _ask(self) -> None:
         now = time.monotonic()
         for member in self._members:
-            if member.lease is not None and member.question is None and now - member.asked_at > LOOK_EVERY:
+            if (
+                member.assignment is not None
+                and member.question is None
+                and now - member.asked_at > LOOK_EVERY
+            ):
                 member.question, member.asked_at = member.actor.progress.remote(), now
 
     def _answer_of(self, member: Remote) -> list[Report]:
@@ -197,10 +201,10 @@ class RayWorkers(Workers[Remote]):
             steps, psnr = ray.get(question, timeout=0)
         except (of_ray.RayActorError, of_ray.GetTimeoutError):
             return []  # what it was asked to do fails likewise, and says why
-        if member.lease is None:
+        if member.assignment is None:
             return []
         member.done = steps
-        return [StepsSeen(member.lease.number, steps, psnr)]
+        return [StepsSeen(member.assignment.number, steps, psnr)]
 
     def _end_of(self, member: Remote, ref: ray.ObjectRef) -> list[Report]:
         try:
@@ -212,17 +216,17 @@ class RayWorkers(Workers[Remote]):
             raise _as_user_error(error, member.number) from error
         except of_ray.RayError as error:
             return self._replace(member, first_line(error))
-        member.asked, lease = None, member.put_down()
+        member.asked, assignment = None, member.put_down()
         if not member.ready:
             member.ready, member.pid, self._failed_starts = True, answer, 0
             member.since = member.since or member.free_since
             return []
         member.visits += 1
-        return [Finished(lease.number, answer.opened())]
+        return [Finished(assignment.number, answer.opened())]
 
     def _replace(self, member: Remote, why: str) -> list[Report]:
         """Start another in place of one that is gone."""
-        lost = [] if member.lease is None else [Lost(member.lease.number, why)]
+        lost = [] if member.assignment is None else [Lost(member.assignment.number, why)]
         member.deaths += 1
         self._failed_starts += not member.ready
         if self._failed_starts >= STARTS:

@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch.nn import Parameter
 
-from abcd_ns.cluster.lease import VisitOutcome, VisitTask
+from abcd_ns.cluster.assignment import VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import squared_errors
-from abcd_ns.engine.store.lent_scene import LentScene
+from abcd_ns.engine.store.assigned_scene import AssignedScene
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
@@ -50,7 +50,7 @@ class RunSetup:
         return RunSetup(run.config, run.budget, list(run.views.values()), options, layer_room)
 
 
-class OnLease(Visits):
+class OnAssignment(Visits):
     """The terms of a visit that somebody else has decided on."""
 
     def __init__(self, run: TrainingRun, task: VisitTask, begun: int) -> None:
@@ -102,14 +102,14 @@ class VisitWorker:
             listen: is told of what happens.
             clock: of training time.
         """
-        scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
+        scene = AssignedScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
         run = self._run_of(task, scene)
         run.announce.subscribe(listen)
         run.announce.subscribe(self._read_ahead)
         run.stopwatch = Stopwatch(task.seconds, clock)
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
-        training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
+        training = VisitTraining(run, OnAssignment(run, task, len(state)), LayerSource(run, layers))
         training.attach(run.active)
         shared = SharedResidual(run, training, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
@@ -119,7 +119,7 @@ class VisitWorker:
         shown, health = state.influence[block], state.health[block]
         return VisitOutcome(result, active.done, shown, health, active.layer_seconds)
 
-    def _run_of(self, task: VisitTask, scene: LentScene) -> TrainingRun:
+    def _run_of(self, task: VisitTask, scene: AssignedScene) -> TrainingRun:
         setup, block = self._setup, task.active.geometry.block
         empty = Gaussians.empty(setup.config.sh_degree, self._device)
         params = {name: Parameter(value) for name, value in empty.items()}

@@ -1,4 +1,4 @@
-"""What the coordinator tells whoever listens: terminal, viewer, logs. It knows none of them."""
+"""Events that the coordinator announces to its listeners: terminal, viewer, logs. It knows none of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ class VisitBegan:
     visit: int
     sweep: int
     block: int | None
-    """None for the warm-up, in which a scaffold of all blocks is trained."""
+    """None for the warm-up, in which a coarse model of all blocks is trained."""
     steps: int
     views: int
     gaussians: int
@@ -57,8 +57,8 @@ class VisitEnded:
 
 
 @dataclass(frozen=True)
-class SweepEnded:
-    """Every observed block was visited once more."""
+class EpochEnded:
+    """An epoch ended: every observed block was visited once more."""
 
     sweep: int
     step: int
@@ -75,8 +75,8 @@ class BlockSplit:
 
 
 @dataclass(frozen=True)
-class Mended:
-    """Something in the live block was wrong and was put right."""
+class Repaired:
+    """Something in the active block was wrong and was repaired."""
 
     visit: int
     block: int | None
@@ -129,8 +129,8 @@ class WorkerLost:
 
 
 @dataclass(frozen=True)
-class Shedding:
-    """The run is complete but for its last shedding, which draws training views again and again."""
+class Pruning:
+    """The run is complete but for its final pruning, which draws training views again and again."""
 
     done: int
     total: int
@@ -138,8 +138,8 @@ class Shedding:
 
 
 @dataclass(frozen=True)
-class ShedAtEnd:
-    """The last shedding is over."""
+class PrunedAtEnd:
+    """The final pruning is over."""
 
     gone: int
     """Gaussians that were taken out."""
@@ -168,14 +168,14 @@ Event = (
     | LayersDrawn
     | StepTaken
     | VisitEnded
-    | SweepEnded
+    | EpochEnded
     | BlockSplit
-    | Mended
+    | Repaired
     | PhotosWanted
     | WorkersSeen
     | WorkerLost
-    | Shedding
-    | ShedAtEnd
+    | Pruning
+    | PrunedAtEnd
     | HeldOutScored
 )
 Listener = Callable[[Event], None]

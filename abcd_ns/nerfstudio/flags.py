@@ -41,7 +41,7 @@ def opens_ours(words: Sequence[str]) -> bool:
 
 
 def as_a_command() -> AbstractContextManager:
-    """Where a command opens a run of ours, end it in one line by what the user can mend.
+    """Where a command opens a run of ours, end it in one line by what the user can repair.
 
     Python that opens one gets the exception, and so does `ns-train`, which has blocks to put on disk first.
     """

@@ -20,7 +20,7 @@ from torch.nn import Parameter, ParameterDict
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.fog import fog_in_white
-from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Ownership, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, psnr, squared_errors, ssim_windows
@@ -239,49 +239,49 @@ class AbcdModel(SplatfactoModel):
     def draw_merged(self, view: View) -> Raster:
         """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
 
-        Where the device should not hold them all they are drawn unit by unit, by fragments: these fold to the
+        Where the device should not hold them all they are drawn node by node, by fragments: these fold to the
         same picture.
         """
         training, too_large = self._coordinator, self._loaded_is_too_large
         if training is not None:
             too_large = training.count() > min(default_pass(self.scene()), self._most_at_once())
         if too_large:
-            return self._by_units(view, "fragments").everything()
+            return self._by_nodes(view, "fragments").everything()
         gaussians = self._crop(self.merged(self.device).to(self.device))
         return self.draws_with()(gaussians, view, **vars(self._settings()))
 
     @torch.no_grad()
     def draw_composited(self, view: View) -> Layer:
         """Each block alone, then folded front to back: what block training composites."""
-        pictures = self._by_units(view, self.config.ownership, pass_gaussians=0)
-        return pictures.painter.picture(view, pictures.settings)
+        pictures = self._by_nodes(view, self.config.ownership, pass_gaussians=0)
+        return pictures.renderer.picture(view, pictures.settings)
 
     @torch.no_grad()
     def draw_normals(self, view: View) -> Tensor:
         """Which way what is seen faces in world space, (n + 1) / 2, [H, W, 3]; of what the viewer shows."""
         paint = partial(colored_by_normal, view=view, flat=self.config.primitive == "2dgs")
-        pictures = self._by_units(view, "fragments", keep=lambda g: paint(self._crop(g)), sh_degree=0)
+        pictures = self._by_nodes(view, "fragments", keep=lambda g: paint(self._crop(g)), sh_degree=0)
         show = self.choice.show if viewed.asked_by_viewer() else viewed.Show.EVERYTHING
         return (normals_in(pictures.draw(show, self._chosen_block())) + 1) / 2
 
     @torch.no_grad()
     def fog(self, view: View) -> float:
         """Share of the screen that Gaussians before the view's nearest point take, 0..1."""
-        pictures = self._by_units(view, "fragments", keep=lambda g: fog_in_white(g, view), sh_degree=0)
+        pictures = self._by_nodes(view, "fragments", keep=lambda g: fog_in_white(g, view), sh_degree=0)
         return float(pictures.draw(viewed.Show.EVERYTHING, None).color.mean())
 
     @torch.no_grad()
     def draw_median(self, view: View) -> Tensor:
         """The depth at which half of each pixel is covered, [H, W, 1]; of the whole scene."""
-        pictures = self._by_units(view, "fragments")
-        return median_depth(pictures.painter, view, pictures.settings)[..., None]
+        pictures = self._by_nodes(view, "fragments")
+        return median_depth(pictures.renderer, view, pictures.settings)[..., None]
 
     def draw_for_viewer(self, view: View) -> Raster:
         """What the viewer's user chose to see."""
         choice, block = self.choice, self._chosen_block()
         if choice.show is viewed.Show.EVERYTHING or block is None:
             return self.draw_merged(view)
-        return self._by_units(view, self.config.ownership).draw(choice.show, block)
+        return self._by_nodes(view, self.config.ownership).draw(choice.show, block)
 
     def _chosen_block(self) -> int | None:
         """Which block the viewer's user chose to see; None for none that there is."""
@@ -291,7 +291,7 @@ class AbcdModel(SplatfactoModel):
             block = None if active is None or active.is_whole else active.geometry.block
         return block if block is not None and block < self.tree.num_blocks else None
 
-    def _by_units(
+    def _by_nodes(
         self,
         view: View,
         ownership: Ownership,
@@ -307,7 +307,7 @@ class AbcdModel(SplatfactoModel):
         shown = keep or self._crop
         scene = ChangedScene(whole, lambda _, found: shown(found))
         most = min(default_pass(scene), self._most_at_once())
-        painter = Painter(
+        renderer = LayerRenderer(
             scene,
             [view],
             self.draws_with(),
@@ -317,11 +317,11 @@ class AbcdModel(SplatfactoModel):
         )
         settings = self._settings(sh_degree)
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
-        return viewed.BlockPictures(painter, view, settings, training.recipe.window_weight)
+        return viewed.BlockPictures(renderer, view, settings, training.recipe.window_weight)
 
-    def _settings(self, sh_degree: int | None = None) -> PaintSettings:
+    def _settings(self, sh_degree: int | None = None) -> RenderSettings:
         degree = self.config.sh_degree if sh_degree is None else sh_degree
-        return PaintSettings(degree, self.config.rasterize_mode == "antialiased")
+        return RenderSettings(degree, self.config.rasterize_mode == "antialiased")
 
     def _most_at_once(self) -> int:
         """Gaussians that the device could draw at once, beside what it holds."""

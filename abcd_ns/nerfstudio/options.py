@@ -62,7 +62,7 @@ shown("strategy", "max_gaussians", "price", "split_pixels")(DensityConfig)
 for _config, _flags in SAME.items():
     named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
 
-_HALVES = "each that grows becomes two, large or small"
+_SPLITS = "each that grows becomes two, large or small"
 _ERROR = "set --pipeline.training.density.split-pixels instead: Gaussians grow by error, not by gradients"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
 _OVERSIZED = "oversized Gaussians are shrunk, by their size as the nearest camera sees it"
@@ -73,7 +73,7 @@ UNUSED_OF_MODEL = {
     "stop_split_at": "set --pipeline.training.density.refine-stop, a share of the run, instead",
     "reset_alpha_every": "opacities are not reset: pruning is by contribution",
     **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
-    **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _HALVES),
+    **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _SPLITS),
     **dict.fromkeys(("densify_grad_thresh", "use_absgrad"), _ERROR),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),

@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
-from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkersSeen
+from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkersSeen
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
@@ -31,7 +31,7 @@ from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
-from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume
 from abcd_ns.run.fit import Demand, device_budget, find_fit
 from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
@@ -135,7 +135,7 @@ class AbcdTrainerConfig(TrainerConfig):
         """Choose the device, and look at the options, the folder, what the run goes on from, and the data,
         before anything is written.
 
-        Exits with code 2 and one line for each fault that the user can mend.
+        Exits with code 2 and one line for each fault that the user can repair.
         """
         device = self.machine.device_type
         if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
@@ -201,7 +201,7 @@ class AbcdTrainer(Trainer):
         self._training_state = state
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
-        """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
+        """As nerfstudio's; what the user can repair ends the process with one line and code 2."""
         said = "Stopped before training began."
         with at_once(partial(self._say_that_it_ended, said)), exit_on_user_error():
             super().setup(*args, **kwargs)
@@ -213,7 +213,7 @@ class AbcdTrainer(Trainer):
         self.callbacks = [hold, *self.callbacks, release, after]
 
     def train(self) -> None:
-        """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
+        """As nerfstudio's; a signal, or what the user can repair, ends the process and says how to go on."""
         self._trains = threading.get_ident()
         said = "Stopped at once; what was written until then is safe."
         with at_once(partial(self._say_that_it_ended, said)):
@@ -221,7 +221,7 @@ class AbcdTrainer(Trainer):
 
     def _say_that_it_ended(self, said: str) -> None:
         self._say(said)
-        self._say_how_to_go_on()
+        self._log_how_to_resume()
 
     def _train(self) -> None:
         try:
@@ -244,7 +244,7 @@ class AbcdTrainer(Trainer):
             except StoreError as refused:
                 if not isinstance(error, StoreError):
                     print_error(str(refused))
-            self._say_how_to_go_on()
+            self._log_how_to_resume()
             raise SystemExit(2) from None
         except Exception:
             with suppress(StoreError):  # what went wrong first is what matters
@@ -295,15 +295,15 @@ class AbcdTrainer(Trainer):
 
     def _may_stop(self, event: Event) -> None:
         # They may take long, and nothing could be lost meanwhile.
-        if isinstance(event, (LayersDrawn, Shedding, WorkersSeen)):
+        if isinstance(event, (LayersDrawn, Pruning, WorkersSeen)):
             self._signals.check()
 
     def _end_report(self) -> None:
         for callback in self.callbacks:
             callback.run_callback_at_location(self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
 
-    def _say_how_to_go_on(self) -> None:
-        command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
+    def _log_how_to_resume(self) -> None:
+        command = command_to_resume(sys.argv, self.config.method_name, self.checkpoint_dir)
         if command is None or not has_begun(self.base_dir / STATE / STORE):
             return  # whoever started this training knows better, or there is nothing to go on from yet
         self._say(f"To go on:\n  {command}")

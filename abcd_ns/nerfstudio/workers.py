@@ -7,8 +7,8 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.cluster.assignment import Workers, WorkersError
 from abcd_ns.cluster.connect import check_installed, connect
-from abcd_ns.cluster.lease import Workers, WorkersError
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.train.memory import PHOTO_SHARE

@@ -27,19 +27,19 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
-from abcd_ns.engine.layers.survey import VisitGeometry, survey
+from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, VisitKind
-from abcd_ns.engine.train.schedule import plan_sweep
+from abcd_ns.engine.train.schedule import plan_epoch
 from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -195,7 +195,7 @@ class BlocksAlone(Visits):
             self._look(block)
             owns = any(bool((region == OWN).any()) for region in self._regions.values())
             state.views[block] = len(self._regions) if owns else 0
-        state.queue = list(plan_sweep(0, state.views, 1, None, self._run.config.seed))
+        state.queue = list(plan_epoch(0, state.views, 1, None, self._run.config.seed))
         if not state.queue:
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
 
@@ -208,7 +208,7 @@ class BlocksAlone(Visits):
             self._surfaces = Surfaces(self._scene, list(run.views.values()), run.rasterizer, run.device)
         box, self._regions, self._crops = self._box(block), {}, {}
         begun = self._joined(block).gaussians.to(run.device)
-        crops = survey(begun, block, run.views.values(), run.rasterizer).crops
+        crops = footprints(begun, block, run.views.values(), run.rasterizer).crops
         for view, crop in crops.items():
             region = self._surfaces.region(view, box)[crop.slices].to(run.device)
             if bool(region.any()):

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from abcd_ns.cluster.assignment import Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
-from abcd_ns.cluster.lease import Workers
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
@@ -22,13 +22,13 @@ from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_at_rest
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
-from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
+from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, coarse_model_size
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -37,7 +37,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from abcd_ns.run.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
+from abcd_ns.run.fit import COARSE_MODEL, FITTED, Demand, Fit, RamShares, device_budget, find_fit
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
 from abcd_ns.run.workers import blocks_to_begin_with, number_of_workers
@@ -204,7 +204,7 @@ class RunBuilder:
     def _limits_of(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it resumes with a budget of its
         own."""
-        kept = {name: store.header.get(name, 0) for name in (*FITTED, SCAFFOLD)}
+        kept = {name: store.header.get(name, 0) for name in (*FITTED, COARSE_MODEL)}
         if resumed and self.options.blocks == 0 and self.options.device_budget_gb > 0:
             blocks = BlockTree.from_json(store.header["tree"]).num_blocks
             return {**kept, **self._fit(sum(map(store.counts, range(blocks))), blocks).limits}
@@ -227,16 +227,16 @@ class RunBuilder:
         has_workers = options.workers > 1 or options.cluster is not None
         return blocks_to_begin_with(fit, options.workers if has_workers else 0), fit.limits
 
-    def _scaffold_size(self, gaussians: int, blocks: int, fitted: dict[str, int]) -> int | None:
+    def _coarse_model_size(self, gaussians: int, blocks: int, fitted: dict[str, int]) -> int | None:
         """Gaussians that the warm-up may have; None where there is no warm-up."""
         training, points = self._training, self.capture.points
         if training.warmup == 0 or blocks == 1 or training.recipe.exact or training.recipe.overlap > 0:
             return None
-        # Blocks grow to hold as many Gaussians as there were points, and so may the scaffold.
+        # Blocks grow to hold as many Gaussians as there were points, and so may the coarse model.
         grown = max(min(points, training.density.limit or points), gaussians)
         largest = fitted["block_limit"] or -(-grown // blocks)
         training = replace(training, limits=replace(training.limits, **fitted))
-        return scaffold_size(training, largest, self.capture.pixels)
+        return coarse_model_size(training, largest, self.capture.pixels)
 
     # -- at rest -------------------------------------------------------------------------------------
 
@@ -249,8 +249,8 @@ class RunBuilder:
             tree = build_kd(gaussians.means, blocks)
         else:
             tree = build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
-        keep = self._scaffold_size(len(gaussians), tree.num_blocks, fitted)
-        header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0, ASKED: self.options.blocks}
+        keep = self._coarse_model_size(len(gaussians), tree.num_blocks, fitted)
+        header = {"tree": tree.to_json(), **fitted, COARSE_MODEL: keep or 0, ASKED: self.options.blocks}
         store = ParameterStore.create(folder, {**header, **made_for.header()})
         at_rest = partial(blocks_at_rest, room=keep, seed=training.seed)
         if training.recipe.overlap > 0:

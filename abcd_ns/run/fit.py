@@ -32,7 +32,7 @@ LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels")
 """The limits that follow from the device's memory; a run keeps them."""
-SCAFFOLD = "scaffold_gaussians"
+COARSE_MODEL = "scaffold_gaussians"
 """Another, of the warm-up's memory."""
 BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64

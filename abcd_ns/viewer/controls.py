@@ -64,7 +64,7 @@ class Controls:
         self._block.options = (FOLLOW, *names) if self._trains else names
 
     def write(self, **texts: str) -> None:
-        """Set texts: headline, sweep, photo, blocks, memory, curve."""
+        """Set texts: headline, epoch, photo, blocks, memory, curve."""
         for name, text in texts.items():
             if self._texts[name].content != text:
                 self._texts[name].content = text

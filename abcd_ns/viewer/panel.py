@@ -16,7 +16,7 @@ from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from abcd_ns.engine import events
-from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkerSeen, WorkersSeen
+from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkerSeen, WorkersSeen
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
@@ -30,7 +30,7 @@ from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, time_left
 from abcd_ns.viewer.scenery import Scenery, first_look, nearest_view, views_that_see
 from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
 
-AT_ONCE = (events.VisitBegan, events.VisitEnded, events.SweepEnded, events.ShedAtEnd)
+AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
 """Events that the browser is told of at once, of others once in SECONDS_BETWEEN_UPDATES."""
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 10.0
@@ -106,7 +106,7 @@ class AbcdPanel(ViewerControl):
         """Take an event in."""
         self._history.note(event, self._seconds)
         self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
-        names = {LayersDrawn: "layers", Shedding: "final pruning"}
+        names = {LayersDrawn: "layers", Pruning: "final pruning"}
         self._stage = f"{names[type(event)]} {event.done} of {event.total}" if type(event) in names else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
         if due or isinstance(event, AT_ONCE):

@@ -13,7 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
-from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings, Seen
+from abcd_ns.engine.layers.layer_renderer import FrozenLayers, LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.cpu.reference import MIN_TRANSMITTANCE
 from abcd_ns.engine.render.projection import Splats
@@ -92,11 +92,11 @@ def bounded(view: View) -> View:
 
 @dataclass(frozen=True)
 class BlockPictures:
-    """Draws one view of a scene unit by unit, so that the device never holds more than one of them."""
+    """Draws one view of a scene node by node, so that the device never holds more than one of them."""
 
-    painter: Painter
+    renderer: LayerRenderer
     view: View
-    settings: PaintSettings
+    settings: RenderSettings
     window_weight: float = 0.0
     """See TrainingConfig: F and B are cut as training cuts them."""
 
@@ -108,7 +108,7 @@ class BlockPictures:
         """
         if show is Show.EVERYTHING or block is None:
             return self.everything()
-        own = self.painter.scene.drawn(block, self.painter.device)
+        own = self.renderer.scene.drawn(block, self.renderer.device)
         if show is Show.BLOCK:
             return self._raster(own)
         window = self._window(own)
@@ -120,15 +120,15 @@ class BlockPictures:
 
     @torch.no_grad()
     def everything(self) -> Raster:
-        """The whole scene, nearest unit first, until nothing behind can be seen."""
-        painter, view = self.painter, self.view
-        whole, seen_by = self._nothing(), painter.frusta([(view, view.full)])
-        for unit in painter.order(painter.units(), view):
+        """The whole scene, nearest node first, until nothing behind can be seen."""
+        renderer, view = self.renderer, self.view
+        whole, seen_by = self._nothing(), renderer.frusta([(view, view.full)])
+        for node in renderer.order(renderer.nodes(), view):
             if float(whole.transmittance.max()) < MIN_TRANSMITTANCE:
                 break
-            loaded, window = painter.load(unit, seen_by=seen_by), None
-            if painter.ownership == "fragments" and unit != 0:
-                window = painter.span(unit, view, view.full)
+            loaded, window = renderer.load(node, seen_by=seen_by), None
+            if renderer.ownership == "fragments" and node != 0:
+                window = renderer.span(node, view, view.full)
             next_one = self._raster(loaded.gaussians, None, window)
             layer = over(whole.layer, next_one.layer)
             depth = whole.depth + whole.transmittance * next_one.depth
@@ -141,28 +141,28 @@ class BlockPictures:
         if len(gaussians) == 0 and frozen is None:
             return self._nothing()
         shot = Shot(self.view, self.view.full, frozen, window)
-        return self.painter.rasterizer.draw(gaussians, [shot], **vars(self.settings))[0]
+        return self.renderer.rasterizer.draw(gaussians, [shot], **vars(self.settings))[0]
 
     def _nothing(self) -> Raster:
         view = self.view
-        layer = empty_layer(view.height, view.width, self.painter.device, view.viewmat.dtype)
+        layer = empty_layer(view.height, view.width, self.renderer.device, view.viewmat.dtype)
         return Raster(layer.color, layer.transmittance, torch.zeros_like(layer.transmittance), {})
 
     def _window(self, own: Gaussians) -> ZWindow | None:
-        if self.painter.ownership == "means":
+        if self.renderer.ownership == "means":
             return None
         options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
-        return self.painter.rasterizer.depth_window(own, self.view, crop=self.view.full, **options)
+        return self.renderer.rasterizer.depth_window(own, self.view, crop=self.view.full, **options)
 
     def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
-        painter, view = self.painter, self.view
-        seen_by, seen = painter.frusta([(view, view.full)]), [Seen(view, view.full, window)]
+        renderer, view = self.renderer, self.view
+        seen_by, seen = renderer.frusta([(view, view.full)]), [Seen(view, view.full, window)]
         parts: dict[int, FrozenLayers | None] = {}
-        for unit in painter.units(exclude=block):
-            loaded = painter.load(unit, block, seen_by)
-            (parts[unit],) = painter.paint(unit, loaded, seen, self.settings, active=block)
-            painter.fold_up(parts, unit, view)
-        return painter.fold(parts, view, view.full)
+        for node in renderer.nodes(exclude=block):
+            loaded = renderer.load(node, block, seen_by)
+            (parts[node],) = renderer.render(node, loaded, seen, self.settings, active=block)
+            renderer.fold_up(parts, node, view)
+        return renderer.fold(parts, view, view.full)
 
 
 def _far_away(layer: Layer) -> Raster:

@@ -8,7 +8,7 @@ from enum import Enum
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
 from abcd_ns.engine.train.run_state import RunState
-from abcd_ns.engine.train.step.last_shedding import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
+from abcd_ns.engine.train.step.final_pruning import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
 from abcd_ns.engine.train.trainer import Trainer
 
 SECONDS_BETWEEN_POINTS = 2.0
@@ -36,7 +36,7 @@ class BlockRow:
     block: int
     status: Status
     gaussians: int | None
-    """None while a scaffold of all blocks is trained."""
+    """None while a coarse model of all blocks is trained."""
     psnr: float | None
     """Mean over the crops of its last visit, dB."""
     views: int | None

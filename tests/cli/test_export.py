@@ -17,8 +17,8 @@ from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
-from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
 from tests.reference.scenes import random_gaussians
@@ -64,7 +64,7 @@ def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path)
     assert export(run, out=tmp_path / "before.ply") == 0
     with ParameterStore.open(run / "abcd/store") as store:
         state = BlockState.unpacked(Packed(*store.load(0)))
-        store.commit({0: state[3:].packed(), INBOX: state[:3].packed()})
+        store.commit({0: state[3:].packed(), PENDING: state[:3].packed()})
     assert export(run, out=tmp_path / "after.ply") == 0
     before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
     assert np.array_equal(before, after)
@@ -76,7 +76,7 @@ def test_those_that_nobody_sees_yet_are_left_out(run, tmp_path):
         store.commit({0: state[3:].packed()})
     assert export(run, out=tmp_path / "without.ply") == 0
     with ParameterStore.open(run / "abcd/store") as store:
-        store.commit({0: replace(state, waits=torch.arange(len(state)) < 3).packed()})
+        store.commit({0: replace(state, deferred=torch.arange(len(state)) < 3).packed()})
     assert export(run, out=tmp_path / "waiting.ply") == 0
     assert (tmp_path / "waiting.ply").read_bytes() == (tmp_path / "without.ply").read_bytes()
 

@@ -21,13 +21,13 @@ from abcd_ns.cli.mesh.fusion import Fusion
 from abcd_ns.cli.mesh.surface import Piece, weld, without_specks
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import Gaussians
@@ -68,12 +68,12 @@ def maps(request, tmp_path_factory) -> DepthMaps:
     """The sphere from around it, drawn from two blocks, one after the other."""
     scene, views = sphere(), ring_of_views(8, width=96, height=72)
     parted = MemoryScene(build_kd(scene.means, 2), scene)
-    painter = Painter(parted, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
-    assert len(painter.units()) == 2
-    settings = PaintSettings(sh_degree=3)
-    median = None if request.param == "expected" else partial(median_depth, painter, settings=settings)
+    renderer = LayerRenderer(parted, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
+    assert len(renderer.nodes()) == 2
+    settings = RenderSettings(sh_degree=3)
+    median = None if request.param == "expected" else partial(median_depth, renderer, settings=settings)
     return draw(
-        WholePictures(painter, settings), views, tmp_path_factory.mktemp("maps"), lambda: None, median
+        WholePictures(renderer, settings), views, tmp_path_factory.mktemp("maps"), lambda: None, median
     )
 
 
@@ -117,14 +117,14 @@ def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
     assert list(far.pieces(lambda: None)) == []
     scene, views = sphere(), maps.views[:2]
     scene.opacities[:] = -5.0
-    painter = Painter(
+    renderer = LayerRenderer(
         MemoryScene(build_kd(scene.means, 1), scene),
         views,
         TorchRasterizer(),
         ownership="fragments",
         pass_gaussians=0,
     )
-    faint = draw(WholePictures(painter, PaintSettings(sh_degree=3)), views, tmp_path, lambda: None)
+    faint = draw(WholePictures(renderer, RenderSettings(sh_degree=3)), views, tmp_path, lambda: None)
     assert not len(faint.footprints())
 
 

@@ -19,7 +19,7 @@ from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 
 PACKAGE = Path(cli.__file__).parents[1]
 FLAG = re.compile(r"(?<![\w-])--[a-zA-Z][\w.-]*\w")
-COMMANDS = {command.name: command for command in cli.COMMANDS if not command.hands_on}
+COMMANDS = {command.name: command for command in cli.COMMANDS if not command.passes_on}
 ELSEWHERE = {"--ImageReader.single-camera", "--mask-color", "--at", "--output-path"}
 """Of the program colmap, of nerfstudio's reader nerfstudio-data, of the report's style, and of ns-eval."""
 NERFSTUDIO = {"ns-train": methods.abcd.config, "ns-viewer": RunViewer, "abcd-data": AbcdDataParserConfig}

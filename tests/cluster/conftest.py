@@ -1,4 +1,4 @@
-"""A small scene, and runs of it whose blocks are lent to workers."""
+"""A small scene, and runs of it whose blocks are assigned to workers."""
 
 import pytest
 

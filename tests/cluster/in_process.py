@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from abcd_ns.cluster.lease import Finished, Lease, Report
+from abcd_ns.cluster.assignment import Assignment, Finished, Report
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -19,7 +19,7 @@ class InProcessWorkers:
 
     def __init__(self, worker: VisitWorker, count: int = 1) -> None:
         self._worker, self._count = worker, count
-        self._leases: deque[Lease] = deque()
+        self._assignments: deque[Assignment] = deque()
         self._visits = 0
 
     @property
@@ -30,29 +30,33 @@ class InProcessWorkers:
     @property
     def idle(self) -> int:
         """How many more could be."""
-        return self._count - len(self._leases)
+        return self._count - len(self._assignments)
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """The value itself: what is at rest never changes."""
         return lambda: value
 
-    def submit(self, lease: Lease) -> None:
+    def submit(self, assignment: Assignment) -> None:
         """To be trained when someone waits for it."""
-        self._leases.append(lease)
+        self._assignments.append(assignment)
 
     def hold(self) -> bool:
         """Nothing is under way meanwhile."""
         return True
 
-    def go_on(self) -> None: ...
+    def resume(self) -> None: ...
 
     def wait(self, seconds: float) -> list[Report]:  # noqa: ARG002 - nothing is under way meanwhile
         """Train the visit that was submitted first."""
-        if not self._leases:
+        if not self._assignments:
             return []
-        lease = self._leases.popleft()
+        assignment = self._assignments.popleft()
         self._visits += 1
-        return [Finished(lease.number, self._worker.visit(lease.task, lease.state(), lease.drawn))]
+        return [
+            Finished(
+                assignment.number, self._worker.visit(assignment.task, assignment.state(), assignment.drawn)
+            )
+        ]
 
     def seen(self) -> Sequence[WorkerSeen]:
         """One, who is between two visits."""

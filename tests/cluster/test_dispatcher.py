@@ -1,4 +1,4 @@
-"""Blocks that are lent come back as if they had never left; and nobody who is lost takes anything along."""
+"""Assigned blocks come back as if they had never left; a lost worker loses nothing."""
 
 import random
 from dataclasses import replace
@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from abcd_ns.cluster.assignment import Finished, Lost, StepsSeen, WorkersError
 from abcd_ns.cluster.dispatcher import LOSSES, Dispatcher
-from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
 from abcd_ns.cluster.visit_worker import VisitWorker
-from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
-from abcd_ns.engine.store.settle import with_mail
+from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded, WorkerLost
+from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -22,7 +22,7 @@ class Unreliable:
     """Workers in this process who answer in any order, late, twice, or never.
 
     Args:
-        fate: says what becomes of a lease: "lost", "late" (lost, and answered all the same), or "done".
+        fate: says what becomes of an assignment: "lost", "late" (lost, and answered all the same), or "done".
     """
 
     def __init__(self, inner, fate) -> None:
@@ -37,19 +37,19 @@ class Unreliable:
     def idle(self):
         return self.count - len(self._out)
 
-    def submit(self, lease):
+    def submit(self, assignment):
         assert self.idle > 0
-        self._out.append(lease)
+        self._out.append(assignment)
 
     def wait(self, seconds):
         late, self._late = self._late, []
         if not self._out:
             return late
-        lease, fate = self._fate(self._out)
-        self._out.remove(lease)
-        reports = [StepsSeen(lease.number, 1, 20.0)]
+        assignment, fate = self._fate(self._out)
+        self._out.remove(assignment)
+        reports = [StepsSeen(assignment.number, 1, 20.0)]
         if fate != "lost":
-            self._inner.submit(lease)
+            self._inner.submit(assignment)
             (answer,) = self._inner.wait(seconds)
             reports = [*reports, answer]
         if fate == "done":
@@ -57,20 +57,22 @@ class Unreliable:
         self.lost += 1
         if fate == "late":  # and with another answer
             outcome = reports[-1].outcome
-            self._late = [Finished(lease.number, replace(outcome, state=outcome.state.nobody))]
+            self._late = [Finished(assignment.number, replace(outcome, state=outcome.state.nobody))]
             self.answered_late += 1
-        return [*late, Lost(lease.number, fate)]
+        return [*late, Lost(assignment.number, fate)]
 
 
-@pytest.mark.parametrize("options", [{"density": GROWING}, {"density": STILL, "scaffold": 40, "warmup": 0.3}])
+@pytest.mark.parametrize(
+    "options", [{"density": GROWING}, {"density": STILL, "coarse_model": 40, "warmup": 0.3}]
+)
 def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos, options):
-    alone, lent = make("alone", **options), make("lent", workers=1, lag=1, **options)
+    alone, assigned = make("alone", **options), make("lent", workers=1, lag=1, **options)
     train(alone, photos)
-    train(lent, photos)
-    assert isinstance(lent, Dispatcher)
-    assert alone.state.step == lent.state.step == 60
-    assert equal(whole_scene(alone), whole_scene(lent))
-    assert alone.state.to_json() | {"seconds": 0} == lent.state.to_json() | {"seconds": 0}
+    train(assigned, photos)
+    assert isinstance(assigned, Dispatcher)
+    assert alone.state.step == assigned.state.step == 60
+    assert equal(whole_scene(alone), whole_scene(assigned))
+    assert alone.state.to_json() | {"seconds": 0} == assigned.state.to_json() | {"seconds": 0}
 
 
 @pytest.mark.parametrize(("lag", "seed"), [(2, 0), (4, 1)])
@@ -79,8 +81,8 @@ def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, 
     train(steady, photos)
     rng, workers = random.Random(seed), []
 
-    def fate(leases):
-        return rng.choice(leases), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
+    def fate(assignments):
+        return rng.choice(assignments), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
 
     def unreliable(run):
         workers.append(Unreliable(in_process(run, photos, 2), fate))
@@ -110,12 +112,12 @@ def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(m
             ended.append(event.visit)
 
     run.announce.subscribe(hear)
-    sweeps = listen(run, SweepEnded)
+    epochs = listen(run, EpochEnded)
     train(run, photos)
     assert most > 1
     assert ended == sorted(ended)
     assert not out
-    assert [event.sweep for event in sweeps] == list(range(run.state.sweep + 1))
+    assert [event.sweep for event in epochs] == list(range(run.state.sweep + 1))
     assert run.state.step == 60
 
 
@@ -148,7 +150,9 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
             state = report.outcome.state
             noise = 0.3 * torch.randn(state.gaussians.means.shape, generator=generator)
             moved = replace(state.gaussians, means=state.gaussians.means + noise)
-            reports = [Finished(report.lease, replace(report.outcome, state=replace(state, gaussians=moved)))]
+            reports = [
+                Finished(report.assignment, replace(report.outcome, state=replace(state, gaussians=moved)))
+            ]
         return reports
 
     run.workers.wait = wait
@@ -156,11 +160,11 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
     while not run.finished:
         train_step(run, photos)
         assert run.count() == total
-        moved += run.scene.inbox is not None and len(run.scene.inbox) > 0
+        moved += run.scene.pending is not None and len(run.scene.pending) > 0
     assert moved > 0
     assert (run.scene.tree.num_blocks > 6) == (limit > 0)
     for block in range(run.scene.tree.num_blocks):
-        means = with_mail(run.scene, block).gaussians.means
+        means = with_pending(run.scene, block).gaussians.means
         assert bool((run.scene.tree.assign(means) == block).all())
 
 
@@ -199,7 +203,9 @@ def test_visits_that_are_under_way_are_kept_when_a_run_stops(make, photos):
 
 
 def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):
-    run = make(workers=lambda r: Unreliable(in_process(r, photos, 2), lambda leases: (leases[0], "lost")))
+    run = make(
+        workers=lambda r: Unreliable(in_process(r, photos, 2), lambda assignments: (assignments[0], "lost"))
+    )
     with pytest.raises(WorkersError, match=rf"lost {LOSSES} workers.*abcd plan"):
         train(run, photos)
     assert run.state.step == 0
@@ -216,17 +222,19 @@ def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
 
 def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
     """So the light is what the warm-up has made of it."""
-    run = make(workers=2, lag=2, density=STILL, scaffold=40, warmup=0.3, light="affine")
+    run = make(workers=2, lag=2, density=STILL, coarse_model=40, warmup=0.3, light="affine")
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
     before = {view: run.run.light.of(view).detach() for view in run.views}
     assert any(bool((transform.diff(dim=-1) != 0).any()) for transform in before.values())
-    lent = []
+    assigned = []
     submit = run.workers.submit
-    run.workers.submit = lambda lease: (lent.append(lease.task.light), submit(lease))
+    run.workers.submit = lambda assignment: (assigned.append(assignment.task.light), submit(assignment))
     train(run, photos)
-    assert lent
-    assert all(torch.equal(transform, before[view]) for light in lent for view, transform in light.items())
+    assert assigned
+    assert all(
+        torch.equal(transform, before[view]) for light in assigned for view, transform in light.items()
+    )
     assert all(torch.equal(run.run.light.of(view), before[view]) for view in before)
 
 
@@ -243,7 +251,7 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
     run = make(
         workers=2,
         density=STILL,
-        scaffold=40,
+        coarse_model=40,
         warmup=0.3,
         poses="SO3xR3",
         target=lambda sample: (photos(sample.view.index, sample.crop), None),
@@ -260,8 +268,10 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
 
 
 @pytest.mark.parametrize("stopped_in", ["the warm-up", "a visit"])
-def test_what_was_trained_here_leaves_the_device_before_anything_is_lent(make, photos, stopped_in):
-    options = {"density": STILL} | ({"scaffold": 40, "warmup": 0.3} if stopped_in == "the warm-up" else {})
+def test_what_was_trained_here_leaves_the_device_before_anything_is_assigned(make, photos, stopped_in):
+    options = {"density": STILL} | (
+        {"coarse_model": 40, "warmup": 0.3} if stopped_in == "the warm-up" else {}
+    )
     alone = make("run", **options)
     train(alone, photos, steps=3)
     assert alone.state.active is not None
@@ -270,7 +280,7 @@ def test_what_was_trained_here_leaves_the_device_before_anything_is_lent(make, p
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
     held, submit = [], run.workers.submit
-    run.workers.submit = lambda lease: (held.append(len(run.params["means"])), submit(lease))
+    run.workers.submit = lambda assignment: (held.append(len(run.params["means"])), submit(assignment))
     train(run, photos)
     assert held
     assert not any(held)

@@ -97,7 +97,9 @@ FULL = [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory"
 
 
 @pytest.mark.parametrize("trouble", [*map(raising, FULL), lambda: time.sleep(600)])
-def test_a_visit_without_memory_or_a_word_is_lent_again(make, photos, steady, tmp_path, monkeypatch, trouble):
+def test_a_visit_without_memory_or_a_word_is_assigned_again(
+    make, photos, steady, tmp_path, monkeypatch, trouble
+):
     monkeypatch.setattr(forked_workers, "SILENCE", 3.0)
     run = make(once(tmp_path, trouble))
     train(run, photos)
@@ -147,7 +149,7 @@ def test_what_is_paused_counts_for_no_visit():
     assert workers.hold()
     assert workers.hold()  # as good as once
     time.sleep(0.5)
-    workers.go_on()
+    workers.resume()
     timing.may_end.set()
     assert workers.wait(60.0) == []  # it lives
     with pytest.raises(UserError) as told:
@@ -213,7 +215,7 @@ def test_no_worker_outlives_the_training_process(tmp_path, views, held):
     if driver == 0:
         try:
             run = make_run(tmp_path / "run", views, workers_of)
-            run._lend()
+            run._assign()
             if held:
                 run.workers.hold()
             os.write(writes, " ".join(map(str, run.workers.pids)).encode())

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from abcd_ns.cluster import connect as connecting
+from abcd_ns.cluster.assignment import WorkersError
 from abcd_ns.cluster.connect import check_installed, connect, keep_to_ourselves
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.lease import WorkersError
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -87,12 +87,12 @@ def workers(steady, photos, traps):
 
 
 @pytest.fixture
-def lent(tmp_path, views, workers):
-    """The same run, whose blocks are lent to them."""
-    return lent_to(workers, tmp_path, views)
+def assigned(tmp_path, views, workers):
+    """The same run, whose blocks are assigned to them."""
+    return assigned_to(workers, tmp_path, views)
 
 
-def lent_to(workers: RayWorkers, folder: Path, views) -> Dispatcher:
+def assigned_to(workers: RayWorkers, folder: Path, views) -> Dispatcher:
     """The run that `steady` is of."""
     return make_run(folder, views, lambda _: workers, lag=4, density=GROWING)
 
@@ -101,61 +101,61 @@ def deaths(workers: RayWorkers) -> int:
     return sum(worker.deaths for worker in workers.seen())
 
 
-def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, lent, photos):
-    seen = listen(lent, WorkersSeen)
-    lent_first(lent)
-    train(lent, photos)
-    assert equal(whole_scene(lent), steady[0])
+def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, assigned, photos):
+    seen = listen(assigned, WorkersSeen)
+    assigned_first(assigned)
+    train(assigned, photos)
+    assert equal(whole_scene(assigned), steady[0])
     assert any(all(worker.block is not None for worker in event.workers) for event in seen)
-    assert all(worker.visits > 0 and worker.deaths == 0 for worker in lent.workers.seen())
+    assert all(worker.visits > 0 and worker.deaths == 0 for worker in assigned.workers.seen())
 
 
-def test_a_worker_that_is_killed_takes_nothing_along(steady, lent, photos):
-    before, lost = deaths(lent.workers), listen(lent, WorkerLost)
-    lent_first(lent)
-    os.kill(lent.workers.pids[0], signal.SIGKILL)
-    train(lent, photos)
-    assert (deaths(lent.workers) - before, len(lost)) == (1, 1)
-    assert equal(whole_scene(lent), steady[0])
+def test_a_worker_that_is_killed_takes_nothing_along(steady, assigned, photos):
+    before, lost = deaths(assigned.workers), listen(assigned, WorkerLost)
+    assigned_first(assigned)
+    os.kill(assigned.workers.pids[0], signal.SIGKILL)
+    train(assigned, photos)
+    assert (deaths(assigned.workers) - before, len(lost)) == (1, 1)
+    assert equal(whole_scene(assigned), steady[0])
 
 
-def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos):
+def test_a_worker_that_falls_silent_is_given_up(steady, assigned, photos):
     """As behind a cut cable: it lives, and whatever it may still say counts no more."""
-    lost = listen(lent, WorkerLost)
-    lent_first(lent)
-    silence(lent.workers)
-    train(lent, photos)
+    lost = listen(assigned, WorkerLost)
+    assigned_first(assigned)
+    silence(assigned.workers)
+    train(assigned, photos)
     assert [event.why for event in lost] == ["silent for 60 s"]
-    assert equal(whole_scene(lent), steady[0])
+    assert equal(whole_scene(assigned), steady[0])
 
 
-def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, photos, traps):
-    lost = listen(lent, WorkerLost)
+def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, assigned, photos, traps):
+    lost = listen(assigned, WorkerLost)
     (traps / "torch").touch()
-    train(lent, photos)
+    train(assigned, photos)
     assert [event.why for event in lost] == ["out of memory"]
     assert not (traps / "torch").exists()
-    assert equal(whole_scene(lent), steady[0])
+    assert equal(whole_scene(assigned), steady[0])
 
 
-def test_a_full_object_store_changes_nothing(steady, lent, photos):
+def test_a_full_object_store_changes_nothing(steady, assigned, photos):
     """What has no room in memory waits on disk."""
     held = [ray.put(torch.zeros(30 << 18).numpy()) for _ in range(5)]
     assert ray.cluster_resources()["object_store_memory"] < 150 << 20
-    train(lent, photos)
-    assert equal(whole_scene(lent), steady[0])
+    train(assigned, photos)
+    assert equal(whole_scene(assigned), steady[0])
     assert all(float(ray.get(ref).sum()) == 0 for ref in held)
 
 
 @pytest.mark.parametrize("error", [ObjectStoreFullError, OutOfDiskError])
-def test_where_disk_is_full_too_one_line_says_so(lent, photos, monkeypatch, error):
+def test_where_disk_is_full_too_one_line_says_so(assigned, photos, monkeypatch, error):
     def put(_):
         raise error("no space left on device")
 
     monkeypatch.setattr(ray_workers.ray, "put", put)
     with pytest.raises(WorkersError, match=r"no room for a block: no space left.*--object-store-memory"):
-        train(lent, photos)
-    assert lent.state.step == 0
+        train(assigned, photos)
+    assert assigned.state.step == 0
 
 
 def silence(workers: RayWorkers) -> None:
@@ -174,11 +174,11 @@ def end(workers: RayWorkers) -> None:
         ray.kill(worker.actor)
 
 
-def lent_first(run: Dispatcher) -> None:
+def assigned_first(run: Dispatcher) -> None:
     """Have both workers at it, however long they took to begin."""
     while run.workers.idle < 2:
         run.workers.wait(0.1)
-    run._lend()
+    run._assign()
     assert len(run.state.in_flight) == 2
 
 
@@ -200,7 +200,7 @@ def test_a_worker_of_another_version_is_refused_in_one_line():
 def test_a_visit_that_does_not_fit_a_device_ends_the_run(steady, tmp_path, views, photos, traps):
     """As in one process: nobody else's device would hold it."""
     alone = RayWorkers(1, partial(make_worker, steady[1], photos, traps=traps))
-    run = lent_to(alone, tmp_path, views)
+    run = assigned_to(alone, tmp_path, views)
     (traps / "cuda").touch()
     with pytest.raises(torch.cuda.OutOfMemoryError, match=r"Tried to allocate 2\.00 GiB"):
         train(run, photos)
@@ -250,12 +250,12 @@ def test_a_machine_that_is_lost_takes_nothing_along(steady, tmp_path, views, pho
         other = machines.add_node(num_cpus=1)
         connect(machines.address, cores=2)
         workers = RayWorkers(2, partial(make_worker, steady[1], photos, 0.01))
-        lent = lent_to(workers, tmp_path, views)
-        lent_first(lent)
+        assigned = assigned_to(workers, tmp_path, views)
+        assigned_first(assigned)
         machines.remove_node(other, allow_graceful=False)
-        train(lent, photos)
+        train(assigned, photos)
         assert deaths(workers) > 0
-        assert equal(whole_scene(lent), steady[0])
+        assert equal(whole_scene(assigned), steady[0])
     finally:
         ray.shutdown()
         machines.shutdown()

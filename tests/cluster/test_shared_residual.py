@@ -67,8 +67,8 @@ def test_all_blocks_begin_with_the_picture_of_the_whole_scene_and_share_it(make,
     monkeypatch.setattr(SharedResidual, "_draw", watched)
     run = make(workers=6, lag=6, density=STILL, window_weight=0.0)
     scene, blocks = whole_scene(run), run.scene.tree.num_blocks
-    run._lend()
-    while run._lent[-1].outcome is None:
+    run._assign()
+    while run._in_flight[-1].outcome is None:
         for report in run.workers.wait(0):
             run._hear(report)
     assert {block for block, _ in begun} == set(range(blocks))

@@ -203,5 +203,5 @@ def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(ras
         assert (found - expected).abs().mean() < 1e-4, name
         assert bool((expected < 0.99).any()), name
     # gsplat lists a Gaussian in every tile of its box. One whose only fragment is faint may be in either.
-    found, expected = (set(cut.members.tolist()) for cut in cuts)
+    found, expected = (set(cut.kept_ids.tolist()) for cut in cuts)
     assert len(expected - found) <= 0.02 * len(frozen)

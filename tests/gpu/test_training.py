@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import Mended, StepTaken, VisitEnded
+from abcd_ns.engine.events import Repaired, StepTaken, VisitEnded
 from abcd_ns.engine.render import loss
 from abcd_ns.engine.render.cuda import pairs as gsplat_pairs
 from abcd_ns.engine.store.special_blocks import LIVE
@@ -93,7 +93,7 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photo
     if device.type != "cuda":
         pytest.skip("on the CPU rows are cleaned at once")
     coordinator = begin(tmp_path, blocks=1, density=STILL)
-    told = listen(coordinator, Mended)
+    told = listen(coordinator, Repaired)
     train(coordinator, photos, steps=2)
     optimizer, before = coordinator.optimizers["means"], coordinator.params["means"].detach().clone()
 

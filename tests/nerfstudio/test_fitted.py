@@ -4,7 +4,7 @@ import torch
 
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.recipe import Limits
-from abcd_ns.engine.train.step.last_shedding import LastShedding
+from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.run.fit import Fit
 from abcd_ns.units import GIB
@@ -23,7 +23,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
         return photo(manager, row, crop)
 
     monkeypatch.setattr(AbcdDataManager, "photo", noted)
-    monkeypatch.setattr(LastShedding, "is_wanted", False)  # it reads whole photos, and reduces them
+    monkeypatch.setattr(FinalPruning, "is_wanted", False)  # it reads whole photos, and reduces them
     with monkeypatch.context() as patched:
         patched.setattr("abcd_ns.run.begin.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))

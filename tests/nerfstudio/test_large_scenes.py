@@ -1,4 +1,4 @@
-"""Pictures of a scene that the device could not draw at once: unit by unit, and still the merged picture."""
+"""Pictures of a scene that the device could not draw at once: node by node, and still the merged picture."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.nerfstudio.test_training import configure, run
 
 CLOSE = 5e-4
-"""Drawing stops where 1e-4 of the light is left, and a unit knows nothing of the others."""
+"""Drawing stops where 1e-4 of the light is left, and a node knows nothing of the others."""
 
 
 @pytest.fixture(scope="module", params=["fragments", "means"])
@@ -64,7 +64,7 @@ def assert_same_pictures(found: list[dict], expected: list[dict]) -> None:
         torch.testing.assert_close(one["depth"][seen], other["depth"][seen], rtol=1e-2, atol=1e-2)
 
 
-def test_a_checkpoint_is_drawn_by_units(trained, monkeypatch, drawn):
+def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     expected, count = pictures(pipeline), len(pipeline.model.means)
     surfaces = [dict(one.items()) for one in expected]  # drawn now
@@ -91,7 +91,7 @@ def test_with_room_for_some_blocks_they_are_drawn_together(trained, monkeypatch,
     assert several < len(drawn)
 
 
-def test_blocks_that_are_all_live_are_drawn_by_units_too(data, tmp_path, monkeypatch, drawn):
+def test_blocks_that_are_all_live_are_drawn_by_nodes_too(data, tmp_path, monkeypatch, drawn):
     trainer = run(configure(data, tmp_path, methods.abcd_exact, steps=2))
     drawn.clear()
     expected, count = pictures(trainer.pipeline), len(trainer.pipeline.model.merged())

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from abcd_ns.engine.events import HeldOutScored, Mended, Shedding, StepTaken, VisitBegan
+from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, VisitBegan
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.nerfstudio.run import progress
@@ -45,7 +45,7 @@ def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
     report(VisitBegan(0, 0, 2, steps=1000, views=3, gaussians=40))
     report(StepTaken(1, 0, 999, psnr=20.0))
     report._live.refresh()
-    report(Shedding(2, 8))
+    report(Pruning(2, 8))
     report._live.refresh()
     lines = [re.sub(r"\x1b\[[0-9?]*[a-zA-Z]", "", line) for line in re.split(r"[\r\n]", file.getvalue())]
     assert any(
@@ -57,9 +57,9 @@ def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
 
 def test_what_is_no_number_is_said_at_once(coordinator, capsys):
     report = ProgressReport(coordinator)
-    report(Mended(4, 1, "gradients", 12))
-    report(Mended(4, None, "values", 1))
-    report(Mended(4, 1, "transparent", 5))
+    report(Repaired(4, 1, "gradients", 12))
+    report(Repaired(4, None, "values", 1))
+    report(Repaired(4, 1, "transparent", 5))
     assert capsys.readouterr().out.splitlines() == [
         "block 2: 12 gradients that were no numbers set to zero",
         "warm-up: 1 Gaussians that were no numbers replaced",
@@ -76,7 +76,7 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 1: trained",
         "  block 2: seen by no view, left as it was",
         "  block 3: seen by 1 view only",
-        "  3 giants shrunk",
+        "  3 oversized Gaussians shrunk",
     ]
 
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import EpochEnded, HeldOutScored, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import run_log
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
@@ -192,7 +192,7 @@ def test_the_psnr_of_a_visit_is_that_of_its_later_half(tmp_path):
     for psnr in (10.0, 12.0, 20.0, 22.0):
         take_steps(log, coordinator, 1, seconds=0.1, psnr=psnr)
     log(VisitEnded(0, 0, 1, gaussians=50, migrated=2, layer_seconds=0.1, seconds=0.4))
-    log(SweepEnded(0, 4))
+    log(EpochEnded(0, 4))
     log.close()
     (ended,) = (line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "visit end")
     assert (ended["psnr"], ended["visit_seconds"], ended["migrated"]) == (21.0, 0.4, 2)

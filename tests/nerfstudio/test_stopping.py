@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_resume
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +68,7 @@ def test_handlers_are_put_back():
     ],
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):
-    assert command_to_go_on(argv.split(), "abcd", Path("my run")) == expected
+    assert command_to_resume(argv.split(), "abcd", Path("my run")) == expected
 
 
 def test_in_another_thread_signals_stay_as_they_are():

@@ -247,7 +247,7 @@ def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])
-def test_what_a_user_can_mend_ends_a_tool_in_one_line(
+def test_what_a_user_can_repair_ends_a_tool_in_one_line(
     data, trained, tmp_path, capsys, monkeypatch, moved, words
 ):
     scene = tmp_path / "elsewhere"

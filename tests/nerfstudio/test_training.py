@@ -19,7 +19,7 @@ from abcd_ns import methods
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
@@ -129,7 +129,7 @@ def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     tree = BlockTree.from_json(store.header["tree"])
     scene = StoredScene(tree, store)
     in_store = torch.cat([scene.gaussians_at_rest(block).means for block in range(tree.num_blocks)])
-    special = [other for other in store.blocks if isinstance(other, str) and other != INBOX]
+    special = [other for other in store.blocks if isinstance(other, str) and other != PENDING]
     assert all(store.counts(other) == 0 for other in special)
     assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
     assert len(in_store) == trained.pipeline.coordinator.count() > 150

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.gaussians.param_swap import rates_of_young
+from abcd_ns.engine.gaussians.param_swap import rates_of_under_trained
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -97,7 +97,7 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(exact, photos):
         (sample,) = batch.samples
         for name, rate in rates.items():
             decay = blocks.config.recipe.means_lr_decay ** (step / 12) if name == "means" else 1.0
-            adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(step, 1)
+            adam[name].param_groups[0]["lr"] = rate * decay * rates_of_under_trained(step, 1)
         raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.run.sh_degree)
         picture = composite(raster.layer, sample.background).clamp(0, 1)
         for optimizer in adam.values():

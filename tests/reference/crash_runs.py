@@ -129,7 +129,7 @@ def _open(folder: Path, views: list, commit_seconds: float) -> Coordinator:
         shutil.rmtree(folder / "clone")
     else:
         shutil.rmtree(folder / "store", ignore_errors=True)
-    options = {"blocks": 3, "steps": STEPS, "scaffold": 20, "batch": 2, "density": GROWING}
+    options = {"blocks": 3, "steps": STEPS, "coarse_model": 20, "batch": 2, "density": GROWING}
     options |= {"layer_bytes": LAYER_BYTES, "commit_seconds": commit_seconds, "resume": resume}
     return make_coordinator(folder, random_gaussians(60, seed=1, size=0.12), views, **options)
 

@@ -14,7 +14,7 @@ import torch
 
 from abcd_ns import methods
 from abcd_ns.engine.events import Event, StepTaken
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
@@ -22,7 +22,7 @@ from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
 CURVES = Path(__file__).with_suffix(".json")
-STEPS, BLOCKS, SCAFFOLD = 24, 4, 60
+STEPS, BLOCKS, COARSE_MODEL = 24, 4, 60
 METHODS = ("abcd", "abcd_ablated", "abcd_partition", "abcd_exact", "abcd_paper", "abcd_monolithic")
 OFTEN = {"refine_start": 0.1, "refine_every": 8, "split_pixels": 1.0}
 """So that such short runs grow."""
@@ -54,7 +54,7 @@ def curve_of(method: str, folder: Path) -> dict[str, list[float]]:
         kind, content = independent_trainer, independent_at_rest
     blocks = 1 if method == "abcd_monolithic" else BLOCKS
     if blocks > 1 and options.get("warmup", 1) > 0:
-        options["scaffold"] = SCAFFOLD
+        options["coarse_model"] = COARSE_MODEL
     trainer = make_coordinator(
         folder, start, views, blocks=blocks, steps=STEPS, kind=kind, content=content, **options
     )

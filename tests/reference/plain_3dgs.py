@@ -5,14 +5,14 @@ import random
 import torch
 
 from abcd_ns.engine.gaussians.adam import Adam
-from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_young
+from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_under_trained
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.density.worth import Judged
-from abcd_ns.engine.train.schedule import endless_order, exponential_decay, settling, sh_degree_at
+from abcd_ns.engine.train.schedule import endless_order, exponential_decay, final_decay, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
 
@@ -28,7 +28,7 @@ def train_plain(
     draw, density, growth, refined = TorchRasterizer(), DensityControl(config.density), {}, 0
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
-        share = settling(taken / steps, taken) * rates_of_young(taken, 1)
+        share = final_decay(taken / steps, taken) * rates_of_under_trained(taken, 1)
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.recipe.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share

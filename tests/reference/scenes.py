@@ -18,7 +18,7 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -98,7 +98,7 @@ def make_coordinator(
     steps: int = 40,
     tree: BlockTree | None = None,
     resume: bool = False,
-    scaffold: int | None = None,
+    coarse_model: int | None = None,
     kind: Callable[[TrainingRun], Trainer] | None = None,
     content: Callable = blocks_at_rest,
     ram_bytes: int = 2 << 30,
@@ -121,7 +121,7 @@ def make_coordinator(
     else:
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-        store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
+        store.commit(content(tree, gaussians, *([] if coarse_model is None else [coarse_model])))
     config = training_config(sh_degree=gaussians.sh_degree, **training)
     run = TrainingRun(
         config,

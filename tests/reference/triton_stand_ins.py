@@ -63,16 +63,23 @@ def skips(count: Tensor, norms: Sequence[Tensor]) -> Tensor:
 
 
 def windowed(
-    near: Tensor, far: Tensor, keys: Tensor, owners: Tensor, always: int, bits: int, tiles: int, last_key: int
+    near: Tensor,
+    far: Tensor,
+    isect_ids: Tensor,
+    flatten_ids: Tensor,
+    always: int,
+    bits: int,
+    tiles: int,
+    last_key: int,
 ) -> tuple[Tensor, Tensor]:
     """Keys and owners: those that are kept, and as many others as there were."""
-    place, z = keys >> 32, (keys & 0xFFFFFFFF).int().view(torch.float32)
+    place, z = isect_ids >> 32, (isect_ids & 0xFFFFFFFF).int().view(torch.float32)
     tile = (place >> bits) * tiles + place % (1 << bits)
-    keep = (z >= near[tile]) & (z < far[tile]) | (owners < always)
+    keep = (z >= near[tile]) & (z < far[tile]) | (flatten_ids < always)
     others = int((~keep).sum())
     return (
-        torch.cat((keys[keep], keys.new_full((others,), last_key))),
-        torch.cat((owners[keep], owners.new_zeros(others))),
+        torch.cat((isect_ids[keep], isect_ids.new_full((others,), last_key))),
+        torch.cat((flatten_ids[keep], flatten_ids.new_zeros(others))),
     )
 
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, PARTS_BYTES
+from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
+from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, levels_of
 from abcd_ns.errors import UserError
 from abcd_ns.run.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
@@ -142,19 +142,19 @@ def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
 @pytest.mark.parametrize("block", [1, 3_333, 5_000_000])
 @pytest.mark.parametrize("pixels", [160 * 106, PIXELS])
 def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixels):
-    size = scaffold_size(TRAINING, block, pixels)
+    size = coarse_model_size(TRAINING, block, pixels)
     visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))
     assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
     assert size > block
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():
-    assert scaffold_size(training_config(scaffold_gaussians=500), 3_333, PIXELS) == 500
+    assert coarse_model_size(training_config(scaffold_gaussians=500), 3_333, PIXELS) == 500
 
 
 @pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch_limit": 1}, {"batch_limit": 1, "crop_pixels": 900}])
 def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block(fitted):
-    assert scaffold_size(training_config(**fitted), 3_333, PIXELS) == 3_333
+    assert coarse_model_size(training_config(**fitted), 3_333, PIXELS) == 3_333
 
 
 def test_a_scene_that_fits_is_one_block():

@@ -7,9 +7,9 @@ import weakref
 import pytest
 import torch
 
-from abcd_ns.engine.events import BlockSplit, ShedAtEnd, VisitEnded
+from abcd_ns.engine.events import BlockSplit, PrunedAtEnd, VisitEnded
 from abcd_ns.engine.gaussians.block_state import MOMENTS
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.store.derived_scenes import HeldScene
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -56,17 +56,17 @@ def test_blocks_are_trained(on_device, start, photos, blocks, density, layers):
 
 @pytest.mark.parametrize("together", [0, 1])
 def test_what_is_hardly_missed_goes_at_the_end(on_device, photos, target, monkeypatch, together):
-    monkeypatch.setattr("abcd_ns.engine.train.step.last_shedding.LOSS", 0.5)
+    monkeypatch.setattr("abcd_ns.engine.train.step.final_pruning.LOSS", 0.5)
     options = {"blocks": 2, "steps": 6, "pass_gaussians": together, "target": target}
     coordinator = on_device(**options, density=DensityConfig())
-    told, held = listen(coordinator, ShedAtEnd), []
+    told, held = listen(coordinator, PrunedAtEnd), []
 
     class Watched(HeldScene):
         def __init__(self, *given) -> None:
             super().__init__(*given)
             held.append(weakref.ref(self))
 
-    monkeypatch.setattr("abcd_ns.engine.train.step.last_shedding.HeldScene", Watched)
+    monkeypatch.setattr("abcd_ns.engine.train.step.final_pruning.HeldScene", Watched)
     gc.disable()
     try:
         train(coordinator, photos)
@@ -88,7 +88,7 @@ def test_a_mask_is_waited_for_once(start, counts):
 
 
 @pytest.mark.parametrize(("together", "light"), [(0, "exposure"), (1, "affine")])
-def test_poses_are_refined_by_pictures_of_one_unit_and_of_several(
+def test_poses_are_refined_by_pictures_of_one_node_and_of_several(
     on_device, views, photos, target, together, light, monkeypatch
 ):
     monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
@@ -114,7 +114,7 @@ def test_both_rasterizers_train_alike(on_device, make, photos):
 
 
 def test_a_warm_up_is_trained_and_blocks_that_outgrow_their_limit_are_split(on_device, photos):
-    options = {"steps": 14, "density": GROWING, "scaffold": 100, "warmup": 0.4}
+    options = {"steps": 14, "density": GROWING, "coarse_model": 100, "warmup": 0.4}
     coordinator = on_device(**options, blocks=2, block_limit=60, sole_limit=60)
     splits = listen(coordinator, BlockSplit)
     train(coordinator, photos)
@@ -133,7 +133,7 @@ def test_gaussians_migrate(on_device, photos):
     assert sum(event.migrated for event in ended) > 0
 
 
-def test_what_is_no_number_is_mended(on_device, photos):
+def test_what_is_no_number_is_repaired(on_device, photos):
     coordinator = on_device(blocks=2, steps=8, density=GROWING)
     train(coordinator, photos, steps=3)
     with torch.no_grad():
@@ -184,8 +184,8 @@ def test_blocks_are_trained_apart(on_device, photos):
 def test_a_picture_is_composited(on_device, views, photos, ownership, rasterizer):
     coordinator = on_device(rasterizer=rasterizer, blocks=4, steps=2, ownership=ownership)
     draws, scene = coordinator.run.rasterizer, coordinator.scene
-    painter = Painter(scene, views, draws, ownership=ownership, pass_gaussians=0, device=DEVICE)
-    layer = painter.picture(views[0], PaintSettings(1, False))
+    renderer = LayerRenderer(scene, views, draws, ownership=ownership, pass_gaussians=0, device=DEVICE)
+    layer = renderer.picture(views[0], RenderSettings(1, False))
     assert layer.color.device == DEVICE
     if ownership == "fragments":
         merged = TorchRasterizer(use_native=False)(whole_scene(coordinator), views[0], sh_degree=1)

@@ -5,8 +5,8 @@ from collections import Counter
 import pytest
 import torch
 
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
-from abcd_ns.engine.layers.painter import Painter
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train import layer_source, memory
 from abcd_ns.engine.train.training_loop import train
@@ -87,12 +87,12 @@ def test_where_steps_take_much_memory_layers_are_drawn_for_more_views_at_once(
         monkeypatch.setattr(module, "PARTS_BYTES", 1)
     monkeypatch.setattr(memory, "PIXEL_FLOATS", floats)
     coordinator = on_device(blocks=4, density=STILL, warmup=0.0, pass_gaussians=1, steps=1)
-    loaded, load = Counter(), Painter.load
+    loaded, load = Counter(), LayerRenderer.load
 
-    def counted(self, unit, **options):
-        loaded[unit] += 1
-        return load(self, unit, **options)
+    def counted(self, node, **options):
+        loaded[node] += 1
+        return load(self, node, **options)
 
-    monkeypatch.setattr(Painter, "load", counted)
+    monkeypatch.setattr(LayerRenderer, "load", counted)
     train(coordinator, photos, steps=1)
     assert set(loaded.values()) == {groups}

@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.events import Mended, StepTaken
+from abcd_ns.engine.events import Repaired, StepTaken
 from abcd_ns.engine.gaussians import param_swap
 from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import lowered
-from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 from abcd_ns.engine.train.health.health import LATE_AFTER
 from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -60,7 +60,7 @@ def test_a_drawing_leaves_nothing_behind(start, views, simulated_gsplat, crop):
 @pytest.mark.parametrize("views", [3, 12])
 def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, views):
     gaussians, ring = random_gaussians(5).to(DEVICE), ring_of_views(views)
-    growth = {name: torch.ones(5).to(DEVICE) for name in WEIGHED}
+    growth = {name: torch.ones(5).to(DEVICE) for name in BLEND_SUMS}
     before = counts.copy()
     wider_than(0.05, gaussians.scales, gaussians.means, ring)
     assert counts.since(before).copies_to_device == 1
@@ -133,7 +133,7 @@ def values(coordinator) -> dict[str, torch.Tensor]:
 @pytest.mark.usefixtures("counts")
 def test_a_step_whose_gradients_are_no_numbers_is_skipped(make, photos):
     coordinator = make(blocks=1, steps=12, density=GATHERING, device=DEVICE)
-    told = listen(coordinator, Mended)
+    told = listen(coordinator, Repaired)
     spoil_once(coordinator, 3)
     spoil_once(coordinator, 6)
     train(coordinator, photos, steps=3)

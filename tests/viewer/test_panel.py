@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import LayersDrawn, Shedding, StepTaken
+from abcd_ns.engine.events import LayersDrawn, Pruning, StepTaken
 from abcd_ns.viewer import panel as panel_module
 from abcd_ns.viewer.panel import AbcdPanel
 
@@ -42,7 +42,7 @@ def draws_meanwhile(panel: AbcdPanel, event) -> bool:
     ("browsers", "event", "seconds", "draws"),
     [
         (1, LayersDrawn(0, 1, 9), 0.0, True),
-        (1, Shedding(1, 9), 0.0, True),
+        (1, Pruning(1, 9), 0.0, True),
         (0, LayersDrawn(0, 1, 9), 0.0, False),
         (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
         (1, LayersDrawn(0, 1, 9), 1e6, False),

@@ -1,4 +1,4 @@
-"""The viewer's pictures: the whole scene by units, and what belongs to one block."""
+"""The viewer's pictures: the whole scene by nodes, and what belongs to one block."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import over
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.derived_scenes import ChangedScene
@@ -27,7 +27,7 @@ from abcd_ns.viewer.pictures import (
 )
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-SETTINGS = PaintSettings(sh_degree=1)
+SETTINGS = RenderSettings(sh_degree=1)
 DRAW = TorchRasterizer()
 GAUSSIANS = random_gaussians(400, size=0.03, dtype=torch.float64)
 VIEW = ring_of_views(3, dtype=torch.float64)[1]
@@ -36,12 +36,12 @@ TREE = build_kd(GAUSSIANS.means, 6)
 
 def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, window_weight=0.0):
     scene = scene or MemoryScene(tree, GAUSSIANS)
-    painter = Painter(scene, [VIEW], DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
-    return BlockPictures(painter, VIEW, SETTINGS, window_weight)
+    renderer = LayerRenderer(scene, [VIEW], DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
+    return BlockPictures(renderer, VIEW, SETTINGS, window_weight)
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 150, 10**6])
-def test_the_scene_by_units_is_the_scene_at_once(pass_gaussians):
+def test_the_scene_by_nodes_is_the_scene_at_once(pass_gaussians):
     merged = DRAW(GAUSSIANS, VIEW, sh_degree=1)
     found = pictures(pass_gaussians=pass_gaussians).draw(Show.EVERYTHING, None)
     for name in ("color", "transmittance", "depth"):
@@ -57,7 +57,7 @@ def drawn(monkeypatch) -> list[int]:
     return counts
 
 
-def test_the_device_holds_one_unit_at_a_time(drawn):
+def test_the_device_holds_one_node_at_a_time(drawn):
     pictures("means").everything()
     assert len(drawn) == 6
     assert max(drawn) < len(GAUSSIANS) / 4

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from abcd_ns.engine.events import StepTaken, VisitBegan, VisitEnded, WorkerSeen
-from abcd_ns.engine.layers.survey import VisitGeometry
+from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
@@ -180,7 +180,7 @@ def test_a_resumed_run_knows_which_blocks_had_their_visit():
     state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1)}
     history = RunHistory.resumed(state)
     statuses = [history.status(block, state.views[block]) for block in range(5)]
-    none = Status.UNTRAINED  # the last one, whose share of the sweep was no step, too
+    none = Status.UNTRAINED  # the last one, whose share of the epoch was no step, too
     assert statuses == [Status.DONE, Status.ACTIVE, none, Status.UNDER_OBSERVED, none]
     state.sweep, state.health[2] = 1, BlockHealth(visits=1)
     assert RunHistory.resumed(state).status(2, 9) is Status.DONE

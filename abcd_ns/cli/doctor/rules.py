@@ -9,7 +9,7 @@ from abcd_ns.units import GIB, bytes_in_words
 
 TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
 """Versions whose insides are relied on."""
-VISER_MENDED = (1, 0, 25)
+VISER_REPAIRED = (1, 0, 25)
 """The first version of viser that serves its own files only."""
 LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
 """Free bytes below which runs of usual size end early."""
@@ -57,7 +57,7 @@ def _of_versions(f: Facts) -> Iterator[Finding]:
             what = f"{name} is {version}; abcd_ns was tested with {tested} and relies on its insides."
             yield warning("untested-version", what, f"If something fails, try pip install {name}=={tested}")
     viser = f.versions.get("viser")
-    if viser is not None and numbers(viser) < VISER_MENDED:
+    if viser is not None and numbers(viser) < VISER_REPAIRED:
         yield note(
             "viewer-hole",
             f"viser {viser} sends every file that you can read to anyone that reaches the viewer's port. "

@@ -8,10 +8,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
+from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.special_blocks import INBOX, BlockName
+from abcd_ns.engine.store.special_blocks import PENDING, BlockName
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
@@ -84,19 +84,19 @@ class Shown:
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
         """These parameters, the means among them, of the block's active Gaussians and of pending migrants."""
         found = self._columns(block, names)
-        seen = ~found.pop(WAITS)
+        seen = ~found.pop(IS_DEFERRED)
         found = {name: value[seen] for name, value in found.items()}
-        if INBOX not in self.store.blocks:
+        if PENDING not in self.store.blocks:
             return found
-        inbox = self._columns(INBOX, names)
-        here = self._tree.assign(inbox["means"]) == block
-        return {name: torch.cat([value, inbox[name][here]]) for name, value in found.items()}
+        pending = self._columns(PENDING, names)
+        here = self._tree.assign(pending["means"]) == block
+        return {name: torch.cat([value, pending[name][here]]) for name, value in found.items()}
 
     def _columns(self, name: BlockName, names: tuple[str, ...]) -> dict[str, Tensor]:
         if "features_rest" not in names:
-            return self.store.load(name, (*names, WAITS))[0]
+            return self.store.load(name, (*names, IS_DEFERRED))[0]
         packed = Packed(*self.store.load(name, DRAWN))
-        return {**dict(packed.gaussians().items()), WAITS: packed.tensors[WAITS]}
+        return {**dict(packed.gaussians().items()), IS_DEFERRED: packed.tensors[IS_DEFERRED]}
 
     def _placed(self, means: Tensor) -> Tensor:
         return means.double() if self.to is None else self.to.points(means)

@@ -17,7 +17,7 @@ from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, wr
 from abcd_ns.cli.report.run_folder import pipeline_config, read_settings
 from abcd_ns.cli.run_path import find_run
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import make_rasterizer
@@ -129,14 +129,14 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
 
 
 def _surface(
-    painter: Painter, settings: PaintSettings, views: list[View], wanted: Wanted
+    renderer: LayerRenderer, settings: RenderSettings, views: list[View], wanted: Wanted
 ) -> tuple[Piece, float]:
     """The mesh in the frame of the options, and the side of its voxels there."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
     with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
-        pictures = WholePictures(painter, settings)
-        median = partial(median_depth, painter, settings=settings) if wanted.median else None
+        pictures = WholePictures(renderer, settings)
+        median = partial(median_depth, renderer, settings=settings) if wanted.median else None
         with ProgressBar("drawing", len(views)) as bar:
             maps = draw(pictures, views, Path(folder), bar.advance, median)
         footprints = maps.footprints()
@@ -156,7 +156,9 @@ def _surface(
     return replace(found, vertices=vertices), side * wanted.to.scale
 
 
-def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, PaintSettings, list[View]]:
+def _seen(
+    store: ParameterStore, config: AbcdPipelineConfig
+) -> tuple[LayerRenderer, RenderSettings, list[View]]:
     """What renders the scene, and its training views, as posed in the data."""
     check_trained(store)
     mirror(config.training, config.model)
@@ -169,7 +171,7 @@ def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, P
     scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
     of_each = drawing_bytes(config.training.sh_degree, config.training.primitive)
     room = int(FREE_SHARE * free_bytes(device)) // of_each
-    painter = Painter(
+    renderer = LayerRenderer(
         scene,
         views,
         make_rasterizer(config.model.rasterizer, device, primitive=config.training.primitive),
@@ -177,4 +179,4 @@ def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, P
         pass_gaussians=min(default_pass(scene), room),
         device=device,
     )
-    return painter, PaintSettings(config.training.sh_degree, config.training.antialiased), views
+    return renderer, RenderSettings(config.training.sh_degree, config.training.antialiased), views

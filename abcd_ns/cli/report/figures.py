@@ -8,9 +8,9 @@ from abcd_ns.engine.train.memory import FLOAT
 from abcd_ns.lab.results.tables import NOTHING
 from abcd_ns.nerfstudio.run.log_lines import (
     EndLine,
+    EpochEndLine,
+    PrunedAtEndLine,
     SampleLine,
-    ShedAtEndLine,
-    SweepEndLine,
     TrainingLine,
     VisitLine,
     WorkerLine,
@@ -58,8 +58,8 @@ def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
         mean, most = sum(held_out.fog) / len(held_out.fog), max(held_out.fog)
         found["fog"] = f"{mean:.1%} of the screen, {most:.1%} at most: Gaussians before the nearest point"
     if story.visits and story.blocks > 1:
-        found["visits"] = f"{len(story.visits)}, {len(story.of(SweepEndLine))} passes over all blocks"
-    if (pruned := story.last(ShedAtEndLine)) is not None:
+        found["visits"] = f"{len(story.visits)}, {len(story.of(EpochEndLine))} passes over all blocks"
+    if (pruned := story.last(PrunedAtEndLine)) is not None:
         cost, views = pruned.before - pruned.after, many(pruned.views, "training view", "training views")
         share = pruned.gone / max(pruned.gone + pruned.gaussians, 1)
         found["pruned at the end"] = f"{pruned.gone:,} ({share:.0%}), costs {cost:.2f} dB on {views}"

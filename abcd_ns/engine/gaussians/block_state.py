@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.packed import WAITS, Packed, pack
+from abcd_ns.engine.gaussians.packed import IS_DEFERRED, Packed, pack
 from abcd_ns.engine.types import Gaussians, as_indices
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -42,14 +42,14 @@ class BlockState:
     growth: dict[str, Tensor] = field(default_factory=dict)
     """Density control's running statistics, each [n, ...]."""
     clocks: Clocks = field(default_factory=Clocks)
-    waits: Tensor | None = None
-    """Bool [n]: who is not to be seen before the block's next visit. None becomes nobody."""
+    deferred: Tensor | None = None
+    """Bool [n]: deferred points, not drawn before the block's next visit. None defers nothing."""
 
     def __post_init__(self) -> None:
-        if self.waits is None:
+        if self.deferred is None:
             nobody = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.device)
-            object.__setattr__(self, "waits", nobody)
-        rows = {len(self.gaussians), len(self.exp_avg), len(self.exp_avg_sq), len(self.waits)}
+            object.__setattr__(self, "deferred", nobody)
+        rows = {len(self.gaussians), len(self.exp_avg), len(self.exp_avg_sq), len(self.deferred)}
         rows |= {value.shape[0] for value in self.growth.values()}
         if len(rows) != 1:
             raise ValueError(f"a block's tensors must have equally many rows, not {sorted(rows)}")
@@ -77,7 +77,7 @@ class BlockState:
         """With each of its parts changed, but for the clocks."""
         gaussians, moments = change(self.gaussians), (change(getattr(self, name)) for name in MOMENTS)
         growth = {name: change(value) for name, value in self.growth.items()}
-        return BlockState(gaussians, *moments, growth, self.clocks, change(self.waits))
+        return BlockState(gaussians, *moments, growth, self.clocks, change(self.deferred))
 
     def forgetful(self) -> "BlockState":
         """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
@@ -98,7 +98,9 @@ class BlockState:
         parts = {"": self.gaussians, **{f"{moment}.": getattr(self, moment) for moment in MOMENTS}}
         tensors, known = pack(parts)
         growth = {f"growth.{name}": value for name, value in self.growth.items()}
-        return Packed({**tensors, WAITS: self.waits, **growth}, {"clocks": vars(self.clocks), **known})
+        return Packed(
+            {**tensors, IS_DEFERRED: self.deferred, **growth}, {"clocks": vars(self.clocks), **known}
+        )
 
     @staticmethod
     def unpacked(packed: Packed) -> "BlockState":
@@ -106,8 +108,8 @@ class BlockState:
         columns = packed.tensors.items()
         growth = {k.removeprefix("growth."): v for k, v in columns if k.startswith("growth.")}
         moments = (packed.gaussians(f"{moment}.") for moment in MOMENTS)
-        clocks, waits = BlockState.clocks_of(packed.meta), packed.tensors[WAITS]
-        return BlockState(packed.gaussians(), *moments, growth, clocks, waits)
+        clocks, deferred = BlockState.clocks_of(packed.meta), packed.tensors[IS_DEFERRED]
+        return BlockState(packed.gaussians(), *moments, growth, clocks, deferred)
 
     @staticmethod
     def clocks_of(meta: dict[str, Any]) -> Clocks:
@@ -130,7 +132,7 @@ def join(states: Sequence[BlockState]) -> BlockState:
         *(Gaussians.cat([getattr(state, moment) for state in states]) for moment in MOMENTS),
         growth,
         states[0].clocks,
-        torch.cat([state.waits for state in states]),
+        torch.cat([state.deferred for state in states]),
     )
 
 

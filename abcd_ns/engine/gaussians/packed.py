@@ -14,9 +14,10 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use, up_to_degree
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
-WAITS, DEGREES = "waits", "degrees"
-"""Columns: who waits; the highest degree in use of each Gaussian's harmonics, which its moments share."""
-DRAWN = (*PARAM_NAMES, WAITS, DEGREES)
+IS_DEFERRED, DEGREES = "waits", "degrees"
+"""Columns: deferred Gaussians; the highest degree in use of each Gaussian's harmonics, which its moments
+share."""
+DRAWN = (*PARAM_NAMES, IS_DEFERRED, DEGREES)
 """What is needed of a block to draw it."""
 
 

@@ -27,7 +27,7 @@ LEARNING_RATES = {
 """Splatfacto's. The means' is in the reach of views, see View, and decays with the progress of the run."""
 RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
-YOUNG_RATES = 4.0
+UNDER_TRAINED_RATES = 4.0
 """Times as large they are before, at most; a step of four views is as large as that by itself."""
 
 PINNED_BYTES = 256 << 20
@@ -118,7 +118,7 @@ class Pace:
     """Learning rates and memories of the optimizers, as they were given for steps of one view each.
 
     Args:
-        fast_start: they are larger while a block has had few steps, see `rates_of_young`.
+        fast_start: they are larger while a block has had few steps, see `rates_of_under_trained`.
     """
 
     def __init__(self, optimizers: Optimizers, fast_start: bool) -> None:
@@ -134,7 +134,7 @@ class Pace:
         views' worth a step (Malladi et al. 2022, "On the SDEs and scaling rules for adaptive gradient
         algorithms", have the square root, for gradients that are noise).
         """
-        share = damping * (rates_of_young(trained, batch) if self._fast_start else 1.0)
+        share = damping * (rates_of_under_trained(trained, batch) if self._fast_start else 1.0)
         for name, (rate, betas) in self._given.items():
             group = self._optimizers[name].param_groups[0]
             decay = means_decay if name == "means" else 1.0
@@ -142,7 +142,7 @@ class Pace:
             group["betas"] = tuple(beta**batch for beta in betas)
 
 
-def rates_of_young(views: int, batch: int) -> float:
+def rates_of_under_trained(views: int, batch: int) -> float:
     """By how much learning rates are larger for a block that was trained on so many views yet.
 
     A step of Adam moves a parameter by about its rate, whatever the gradient: how far a block gets in T steps
@@ -150,7 +150,7 @@ def rates_of_young(views: int, batch: int) -> float:
     they are those that steps of `batch` views have.
     """
     steps = max(views, 1) / batch
-    return max(min(math.sqrt(RATED_FOR / steps), YOUNG_RATES) / batch, 1.0)
+    return max(min(math.sqrt(RATED_FOR / steps), UNDER_TRAINED_RATES) / batch, 1.0)
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.painter import FrozenLayers
+from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Layer
 

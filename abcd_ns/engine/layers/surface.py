@@ -1,4 +1,4 @@
-"""Which way what a pixel shows faces, and how far away most of it is: of a whole scene, unit by unit.
+"""Which way what a pixel shows faces, and how far away most of it is: of a whole scene, node by node.
 
 Nothing of this is drawn unless it is asked for.
 """
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render import Raster, Rasterizer
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.types import Gaussians, View
@@ -61,27 +61,27 @@ def normals_in(raster: Raster) -> Float[Tensor, "h w 3"]:
 
 
 @torch.no_grad()
-def median_depth(painter: Painter, view: View, settings: PaintSettings) -> Float[Tensor, "h w"]:
+def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) -> Float[Tensor, "h w"]:
     """Camera z of the Gaussian at which half of each pixel is covered, world units: the last that is drawn
     while the transmittance is above a half, as in 2DGS (Huang et al. 2024) and gsplat's `render_median`; 0
     where nothing is.
 
     By the torch rasterizer, on whatever device: gsplat's kernels give it for surfels alone, and for all of a
-    ray. Here a unit goes on from the transmittance that those in front leave, so that any division by
+    ray. Here a node goes on from the transmittance that those in front leave, so that any division by
     fragments gives the same.
     """
-    rasterizer = _torch(painter.rasterizer)
-    like = {"device": painter.device, "dtype": view.viewmat.dtype}
+    rasterizer = _torch(renderer.rasterizer)
+    like = {"device": renderer.device, "dtype": view.viewmat.dtype}
     left, depth = (
         torch.ones((view.height, view.width), **like),
         torch.zeros((view.height, view.width), **like),
     )
-    seen_by = painter.frusta([(view, view.full)])
-    for unit in painter.order(painter.units(), view):
+    seen_by = renderer.frusta([(view, view.full)])
+    for node in renderer.order(renderer.nodes(), view):
         if float(left.max()) <= 0.5:
             break
-        gaussians = painter.load(unit, seen_by=seen_by).gaussians
-        window = painter.span(unit, view, view.full) if unit else None
+        gaussians = renderer.load(node, seen_by=seen_by).gaussians
+        window = renderer.span(node, view, view.full) if node else None
         if len(gaussians):
             left, depth = rasterizer.deepened(
                 gaussians, view, window, (left, depth), antialiased=settings.antialiased

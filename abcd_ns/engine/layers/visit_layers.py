@@ -6,17 +6,17 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import (
+from abcd_ns.engine.layers.footprints import VisitGeometry
+from abcd_ns.engine.layers.layer_renderer import (
     BYTES_PER_PIXEL,
     PARTS_BYTES,
     FrozenLayers,
+    LayerRenderer,
     Loaded,
-    Painter,
-    PaintSettings,
+    RenderSettings,
     Seen,
 )
-from abcd_ns.engine.layers.survey import VisitGeometry
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.render import ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.together import runs
@@ -31,29 +31,29 @@ class VisitLayers:
         own: the block's Gaussians when the visit began; they decide the windows.
         window_weight: see Recipe.
         views: all views, by index.
-        parts_bytes: size of the layers held while units are folded.
+        parts_bytes: size of the layers held while nodes are folded.
     """
 
     def __init__(
         self,
-        painter: Painter,
+        renderer: LayerRenderer,
         store: LayerStore,
         geometry: VisitGeometry,
         own: Gaussians,
         views: Mapping[int, View],
-        settings: PaintSettings,
+        settings: RenderSettings,
         *,
         window_weight: float,
         parts_bytes: int = PARTS_BYTES,
     ) -> None:
-        self._painter, self._store = painter, store
+        self._renderer, self._store = renderer, store
         # A copy: whatever becomes of the views, these are drawn.
         self._geometry, self._views, self._settings = geometry, dict(views), settings
         self._window_weight, self._parts_bytes = window_weight, parts_bytes
-        self._units = painter.units(exclude=geometry.block)
-        self._own = own if painter.ownership == "fragments" else None
+        self._nodes = renderer.nodes(exclude=geometry.block)
+        self._own = own if renderer.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
-        self._seen_by = painter.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
+        self._seen_by = renderer.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
         self._windows: dict[int, ZWindow] = {}
         self._loaded: dict[int, int] = {}
         self._sum: Tensor | float = 0.0
@@ -78,24 +78,24 @@ class VisitLayers:
 
     def _groups(self, views: Sequence[int]) -> Iterable[Sequence[int]]:
         """Views that are drawn together: as many as there is room for what their units are folded from."""
-        if len(self._units) == 1:
+        if len(self._nodes) == 1:
             return [views]
-        levels = max(map(self._painter.depth_of, self._units), default=0) + 1
+        levels = max(map(self._renderer.depth_of, self._nodes), default=0) + 1
         crops = [self._geometry.crops[view] for view in views]
         return runs(views, crops, self._parts_bytes // (levels * BYTES_PER_PIXEL))
 
     def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
-        """All units one after the other, each for all of these views: the device holds one at a time."""
+        """All nodes one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         block = self._geometry.block
         parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
-        for unit in self._units:
-            loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
-            self._loaded[unit] = len(loaded.gaussians)
-            for view, part in zip(views, self._paint(unit, loaded, views), strict=True):
-                parts[view][unit] = part
-                self._painter.fold_up(parts[view], unit, self._views[view])
-                if unit == self._units[-1]:
+        for node in self._nodes:
+            loaded = self._renderer.load(node, exclude=block, seen_by=self._seen_by)
+            self._loaded[node] = len(loaded.gaussians)
+            for view, part in zip(views, self._render(node, loaded, views), strict=True):
+                parts[view][node] = part
+                self._renderer.fold_up(parts[view], node, self._views[view])
+                if node == self._nodes[-1]:
                     yield view, self._keep(view, parts.pop(view))
 
     def shows(self, view: View) -> bool:
@@ -126,8 +126,8 @@ class VisitLayers:
         if self._own is None:
             return
         new = [view for view in views if view not in self._windows]
-        found = self._painter.rasterizer.depth_windows(
-            self._own.to(self._painter.device),
+        found = self._renderer.rasterizer.depth_windows(
+            self._own.to(self._renderer.device),
             [(self._views[view], self._geometry.crops[view]) for view in new],
             visible=self._window_weight,
             antialiased=self._settings.antialiased,
@@ -137,12 +137,12 @@ class VisitLayers:
     def _window(self, view: int) -> ZWindow | None:
         return None if self._own is None else self._windows[view]
 
-    def _paint(self, unit: int, loaded: Loaded, views: Sequence[int]) -> Iterator[FrozenLayers | None]:
+    def _render(self, node: int, loaded: Loaded, views: Sequence[int]) -> Iterator[FrozenLayers | None]:
         seen = [Seen(self._views[view], self._geometry.crops[view], self._window(view)) for view in views]
-        return self._painter.paint(unit, loaded, seen, self._settings, active=self._geometry.block)
+        return self._renderer.render(node, loaded, seen, self._settings, active=self._geometry.block)
 
     def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:
-        folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
+        folded = self._renderer.fold(parts, self._views[view], self._geometry.crops[view])
         layers = packed(folded)
         self._sum = self._sum + layers.sum()
         kept = Kept(rounded(layers), folded.inside)

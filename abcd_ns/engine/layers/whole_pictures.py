@@ -1,9 +1,9 @@
-"""Pictures of the whole scene, one unit of it on the device at a time, and their gradient, by the pose say.
+"""Pictures of the whole scene, one node of it on the device at a time, and their gradient, by the pose say.
 
-As exact joint training has them (peers/exact.py), but for the camera: every unit is drawn without gradients
-and all are folded to the picture; a loss gives G = dL/dC; every unit is drawn again, with gradients, and
+As exact joint training has them (peers/exact.py), but for the camera: every node is drawn without gradients
+and all are folded to the picture; a loss gives G = dL/dC; every node is drawn again, with gradients, and
 dL/dC_A = T_F G, dL/dT_A = T_F <G, C_B + T_B b>, where F and B are what is before and behind it. What the pose
-gets from each unit is added up. Layers are cut where the rays of the given pose cross from cell to cell: a
+gets from each node is added up. Layers are cut where the rays of the given pose cross from cell to cell: a
 fragment that moves over a border is the same in either layer, so that the gradient has no part of it.
 """
 
@@ -15,7 +15,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, fold, sandwich
-from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, PARTS_BYTES, Loaded, Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import (
+    BYTES_PER_PIXEL,
+    PARTS_BYTES,
+    LayerRenderer,
+    Loaded,
+    RenderSettings,
+)
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.types import Layer, View
@@ -28,13 +34,15 @@ class WholePictures:
         layers_bytes: size of the layers held at a time, unless a single view has more.
     """
 
-    def __init__(self, painter: Painter, settings: PaintSettings, layers_bytes: int = PARTS_BYTES) -> None:
-        self._painter, self._settings, self._layers_bytes = painter, settings, layers_bytes
-        self._units = painter.units()
+    def __init__(
+        self, renderer: LayerRenderer, settings: RenderSettings, layers_bytes: int = PARTS_BYTES
+    ) -> None:
+        self._renderer, self._settings, self._layers_bytes = renderer, settings, layers_bytes
+        self._nodes = renderer.nodes()
 
     def groups(self, views: Sequence[View]) -> list[list[View]]:
         """Views whose layers have room at the same time: each group reads the scene twice."""
-        pixels = self._layers_bytes // (len(self._units) * BYTES_PER_PIXEL)
+        pixels = self._layers_bytes // (len(self._nodes) * BYTES_PER_PIXEL)
         return list(runs(views, [view.full for view in views], pixels))
 
     @torch.no_grad()
@@ -70,68 +78,68 @@ class WholePictures:
         Args:
             views: no more than have room, see `groups`.
             gradient: gives dL/dC of a view's picture.
-            after: called when a unit's fragments in a view have left theirs; those of other units are others.
+            after: called when a node's fragments in a view have left theirs; those of other nodes are others.
         """
-        if len(self._units) == 1:
-            loaded = self._load(self._units[0], views)
+        if len(self._nodes) == 1:
+            loaded = self._load(self._nodes[0], views)
             for view in views:
                 self._backward_through_one(loaded, view, gradient)
                 after()
             return
         parts = self._draw(views)
         pulls = [gradient(view, self._picture(view, own)) for view, own in zip(views, parts, strict=True)]
-        for unit in self._units:
-            loaded = self._load(unit, views)
+        for node in self._nodes:
+            loaded = self._load(node, views)
             for view, own, pull in zip(views, parts, pulls, strict=True):
-                if unit in own:
-                    self._differentiate(unit, loaded, view, own, pull)
+                if node in own:
+                    self._differentiate(node, loaded, view, own, pull)
                 after()
 
     def _backward_through_one(self, loaded: Loaded, view: View, gradient: Callable) -> None:
-        """As `backward`, for a view, where one unit is all: it is drawn once."""
-        (unit,) = self._units
-        raster = self._raster(unit, loaded, view) if loaded.shows_in(view) else None
-        pull = gradient(view, self._picture(view, {} if raster is None else {unit: _part(raster)}))
+        """As `backward`, for a view, where one node is all: it is drawn once."""
+        (node,) = self._nodes
+        raster = self._raster(node, loaded, view) if loaded.shows_in(view) else None
+        pull = gradient(view, self._picture(view, {} if raster is None else {node: _part(raster)}))
         if raster is not None:
             raster.color.backward(pull, retain_graph=True)  # views share what leads to the loaded Gaussians
 
-    def _load(self, unit: int, views: Sequence[View]) -> Loaded:
-        return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))
+    def _load(self, node: int, views: Sequence[View]) -> Loaded:
+        return self._renderer.load(node, seen_by=self._renderer.frusta((still(v), v.full) for v in views))
 
     @torch.no_grad()
     def _draw(self, views: Sequence[View]) -> list[dict[int, Raster]]:
-        """Of each view, the units that show in it, front to back."""
+        """Of each view, the nodes that show in it, front to back."""
         parts: list[dict[int, Raster]] = [{} for _ in views]
-        for unit in self._units:
-            loaded = self._load(unit, views)
+        for node in self._nodes:
+            loaded = self._load(node, views)
             for view, own in zip(views, parts, strict=True):
                 if loaded.shows_in(view):
-                    own[unit] = _part(self._raster(unit, loaded, view))
+                    own[node] = _part(self._raster(node, loaded, view))
         return [
-            {unit: own[unit] for unit in self._painter.order(tuple(own), still(view))}
+            {node: own[node] for node in self._renderer.order(tuple(own), still(view))}
             for view, own in zip(views, parts, strict=True)
         ]
 
-    def _raster(self, unit: int, loaded: Loaded, view: View) -> Raster:
+    def _raster(self, node: int, loaded: Loaded, view: View) -> Raster:
         window = None
-        if self._painter.ownership == "fragments" and unit:
-            window = self._painter.span(unit, still(view), view.full)
+        if self._renderer.ownership == "fragments" and node:
+            window = self._renderer.span(node, still(view), view.full)
         shot = Shot(view, view.full, None, window)
-        return self._painter.rasterizer.draw(loaded.gaussians, [shot], **vars(self._settings))[0]
+        return self._renderer.rasterizer.draw(loaded.gaussians, [shot], **vars(self._settings))[0]
 
     def _picture(self, view: View, parts: Mapping[int, Raster]) -> Raster:
-        device, dtype = self._painter.device, view.viewmat.dtype
+        device, dtype = self._renderer.device, view.viewmat.dtype
         nothing = empty_layer(view.height, view.width, device, dtype)
         whole = fold([part.layer for part in parts.values()], like=nothing)
         depths = [Layer(p.depth[..., None].expand(-1, -1, 3), p.transmittance) for p in parts.values()]
         return Raster(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0], {})
 
     def _differentiate(
-        self, unit: int, loaded: Loaded, view: View, parts: Mapping[int, Raster], pull: Tensor
+        self, node: int, loaded: Loaded, view: View, parts: Mapping[int, Raster], pull: Tensor
     ) -> None:
-        at, layers = list(parts).index(unit), [part.layer for part in parts.values()]
+        at, layers = list(parts).index(node), [part.layer for part in parts.values()]
         front, back = fold(layers[:at], like=layers[at]), fold(layers[at + 1 :], like=layers[at])
-        picture = sandwich(front, self._raster(unit, loaded, view).layer, back, pull.new_zeros(3))
+        picture = sandwich(front, self._raster(node, loaded, view).layer, back, pull.new_zeros(3))
         picture.backward(pull, retain_graph=True)  # views share what leads to `loaded`
 
 

@@ -68,7 +68,7 @@ class Cut:
     back: Layer
     inside: Splats
     """Those that have any fragment in the middle, in the Gaussians' order."""
-    members: Int[Tensor, "m"]
+    kept_ids: Int[Tensor, "m"]
     """Which of the Gaussians they are."""
 
 
@@ -121,7 +121,7 @@ class Rasterizer(Protocol):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        weigh: bool = False,
+        blend_weights: bool = False,
         judge: bool = False,
     ) -> tuple[Raster, ...]:
         """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
@@ -131,9 +131,9 @@ class Rasterizer(Protocol):
                 rasters may share one `info`, of that many cameras.
             sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
             antialiased: scale opacities by gsplat's compensation factor; of surfels it has none.
-            weigh: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's depth is
-                taken from: after backward its gradient is the sum of the Gaussian's weights alpha T, each
-                times the gradient of the pixel's depth; and that changes no other gradient.
+            blend_weights: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's
+                depth is taken from: after backward its gradient is the sum of the Gaussian's weights alpha T,
+                each times the gradient of the pixel's depth; and that changes no other gradient.
             judge: take residuals, by `info["sums"]`: ResidualSums.
 
         Raises:

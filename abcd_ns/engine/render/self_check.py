@@ -53,7 +53,7 @@ class Case:
     antialiased: bool = False
     windowed: bool = False
     """Each tile has a z window, some of them empty."""
-    weighs: bool = False
+    wants_weights: bool = False
     """The Gaussians' weights are asked for, in place of depths."""
     sh_degree: int = 3
 
@@ -72,7 +72,7 @@ CASES = (
     Case("an antialiased view", antialiased=True),
     Case("a crop", crop=Crop(9, 5, 23, 13), sh_degree=1),
     Case("a view with frozen splats", frozen=9),
-    Case("weights beside frozen splats", frozen=9, weighs=True),
+    Case("weights beside frozen splats", frozen=9, wants_weights=True),
     Case("a crop with frozen splats", crop=Crop(18, 3, 17, 20), frozen=9, antialiased=True),
     Case("two views of different sizes", sizes=(1.0, 1.4), sh_degree=2),
     Case("a z window", windowed=True),
@@ -117,7 +117,7 @@ def values_and_gradients(
     own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
     leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
     shots = case.shots(rasterizer, frozen, view)
-    options = {"antialiased": case.antialiased, "weigh": case.weighs, "judge": True}
+    options = {"antialiased": case.antialiased, "blend_weights": case.wants_weights, "judge": True}
     rasters = rasterizer.draw(Gaussians(**leaves), shots, sh_degree=case.sh_degree, **options)
     infos = list({id(raster.info): raster.info for raster in rasters}.values())
     means2d = [info["means2d"] for info in infos]
@@ -131,7 +131,7 @@ def values_and_gradients(
     results |= {f"gradient of {name}": [leaves[name].grad] for name in PARAM_NAMES}
     results["gradient of means2d"] = [each.grad for each in means2d]
     results["sums of residuals"] = [info["sums"].values for info in infos]
-    results |= {"weights": [info["weights"].grad for info in infos]} if case.weighs else {}
+    results |= {"weights": [info["weights"].grad for info in infos]} if case.wants_weights else {}
     return {name: torch.cat(value).detach().cpu().double() for name, value in results.items()}
 
 

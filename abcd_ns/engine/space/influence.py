@@ -2,8 +2,8 @@
 
 The influence of a Gaussian on a view is the mean, over the image, of its weight alpha T in each pixel: what
 it adds to the picture once everything before it is taken into account. Influences of all Gaussians and of
-the background add up to 1. Rasterizers leave them on their way back, whatever is drawn (`weigh`): so the
-warm-up, which draws the whole scene, tells them of the views that it has used (`InfluenceTable`), and the
+the background add up to 1. Rasterizers leave them on their way back, whatever is drawn (`blend_weights`): so
+the warm-up, which draws the whole scene, tells them of the views that it has used (`InfluenceTable`), and the
 others are drawn small for it.
 """
 
@@ -46,7 +46,9 @@ def weights(
     """For each shot the sum of each Gaussian's weights over its pixels."""
     if not len(gaussians):
         return gaussians.means.new_zeros(len(shots), 0)
-    rasters = rasterizer.draw(gaussians.detach(), shots, sh_degree=0, antialiased=antialiased, weigh=True)
+    rasters = rasterizer.draw(
+        gaussians.detach(), shots, sh_degree=0, antialiased=antialiased, blend_weights=True
+    )
     leaves = {id(raster.info): raster.info["weights"] for raster in rasters}
     found = torch.autograd.grad(sum(raster.depth.sum() for raster in rasters), list(leaves.values()))
     # Shots that share an info are its cameras, in their order.

@@ -13,14 +13,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
+from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
-from abcd_ns.engine.store.scaffold import split_by_block
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
+from abcd_ns.engine.store.coarse_model import split_by_block
+from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import Gaussians
 
@@ -53,13 +53,13 @@ class VisitScene(BlockScene, Protocol):
     """What a visit needs to know of the scene that its block belongs to."""
 
     def state(self, name: BlockName) -> BlockState:
-        """A block at rest and whole, without its mail."""
+        """A block at rest and whole, without its pending migrants."""
 
-    def mail(self, block: int) -> BlockState | None:
+    def pending_for(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
+        """Gaussians at rest under a name, the pending migrants of a block left out; nothing is read."""
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
@@ -112,10 +112,10 @@ class StoredScene(VisitScene):
         self._bounds: dict[int, tuple[int, Box | None]] = {}
         self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
         self._rested = time.monotonic()
-        self._mail: dict[int, BlockState] = {}
-        self.inbox: BlockState | None = None
+        self._pending_by_block: dict[int, BlockState] = {}
+        self.pending: BlockState | None = None
         """All Gaussians that wait for their blocks' visits, in the order in which they came."""
-        self._sort(self.state(INBOX) if self.has(INBOX) else None)
+        self._sort(self.state(PENDING) if self.has(PENDING) else None)
 
     # -- changes -------------------------------------------------------------------------------------
 
@@ -147,8 +147,8 @@ class StoredScene(VisitScene):
                 self._memory.forget(name)
                 self._unsaved[name] = block
                 self._versions[name] = next(self._numbers)
-            if header is not None or INBOX in blocks:
-                self._sort(blocks.get(INBOX, self.inbox))
+            if header is not None or PENDING in blocks:
+                self._sort(blocks.get(PENDING, self.pending))
             unsaved = self.unsaved_bytes  # under the lock: the writer takes out what it has written
             self._memory.shrink(unsaved)
             self._rested = time.monotonic()
@@ -160,14 +160,15 @@ class StoredScene(VisitScene):
             self.flush()
         self._writer.check()
 
-    def _sort(self, inbox: BlockState | None) -> None:
-        """Find out who waits for which block."""
-        before, self.inbox, self._mail = self._mail, inbox, {}
-        if inbox is not None and len(inbox):
-            self._mail = split_by_block(inbox, self.tree.assign(inbox.gaussians.means))
-        for block in before.keys() | self._mail.keys():
+    def _sort(self, pending: BlockState | None) -> None:
+        """Sort the pending migrants by block."""
+        before, self.pending, self._pending_by_block = self._pending_by_block, pending, {}
+        if pending is not None and len(pending):
+            self._pending_by_block = split_by_block(pending, self.tree.assign(pending.gaussians.means))
+        for block in before.keys() | self._pending_by_block.keys():
             old, new = (
-                mail[block].gaussians.means if block in mail else None for mail in (before, self._mail)
+                migrants[block].gaussians.means if block in migrants else None
+                for migrants in (before, self._pending_by_block)
             )
             if old is None or new is None or not torch.equal(old, new):
                 self._versions[block] = next(self._numbers)
@@ -235,7 +236,7 @@ class StoredScene(VisitScene):
         return name in self._unsaved or name in self.store.blocks
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
+        """Gaussians at rest under a name, the pending migrants of a block left out; nothing is read."""
         block = self._unsaved.get(name)
         return self.store.counts(name) if block is None else block.rows
 
@@ -247,12 +248,12 @@ class StoredScene(VisitScene):
         block = self._unsaved.get(name)
         return self.store.meta(name) if block is None else block.meta
 
-    def mail(self, block: int) -> BlockState | None:
+    def pending_for(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
-        return self._mail.get(block)
+        return self._pending_by_block.get(block)
 
     def state(self, name: BlockName) -> BlockState:
-        """A block, or what is kept under a special name, at rest and whole, without its mail."""
+        """A block, or what is kept under a special name, at rest and whole, without its pending migrants."""
         return BlockState.unpacked(self._packed(name, whole=True))
 
     def _packed(self, name: BlockName, *, whole: bool) -> Packed:
@@ -299,22 +300,22 @@ class StoredScene(VisitScene):
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 
     def _seen_at_rest(self, block: int, device: torch.device | str, which: Which | None) -> Gaussians:
-        packed, mail = self._packed(block, whole=False), self.mail(block)
-        rows = ~packed.tensors[WAITS]  # they are not to be seen before the block's next visit
+        packed, migrants = self._packed(block, whole=False), self.pending_for(block)
+        rows = ~packed.tensors[IS_DEFERRED]  # they are not to be seen before the block's next visit
         if which is not None:
             rows &= which(packed.tensors["means"], packed.tensors["scales"])
         found = (packed if bool(rows.all()) else packed.drawn_at(rows)).gaussians(device=device)
-        if mail is None:
+        if migrants is None:
             return found
-        return Gaussians.cat([found, _picked(mail.gaussians, which).to(device)])
+        return Gaussians.cat([found, _picked(migrants.gaussians, which).to(device)])
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        stored, mail = self.stored(block), self.mail(block)
-        return stored if mail is None else Gaussians.cat([stored, mail.gaussians])
+        stored, migrants = self.stored(block), self.pending_for(block)
+        return stored if migrants is None else Gaussians.cat([stored, migrants.gaussians])
 
     def stored(self, name: BlockName) -> Gaussians:
-        """What is at rest under a name, without mail; those included who wait for the block's next visit."""
+        """What is at rest under a name, without pending migrants; deferred points included."""
         return self._packed(name, whole=False).gaussians()
 
     @property
@@ -334,7 +335,7 @@ class StoredScene(VisitScene):
 
     def count(self, block: int) -> int:
         if not self._is_live(block):
-            return self.rows(block) + len(self.mail(block) or ())
+            return self.rows(block) + len(self.pending_for(block) or ())
         # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
         return 0 if self.is_live_as_a_whole and block > 0 else len(self._live[1]())
 
@@ -347,9 +348,9 @@ class StoredScene(VisitScene):
             counted = count_parameters(alive().features_rest.detach())
         for block in range(self.tree.num_blocks) if not self.is_live_as_a_whole else ():
             if block != live:
-                mail = self.mail(block)
+                migrants = self.pending_for(block)
                 counted += self._meta(block)["parameters"]
-                counted += 0 if mail is None else count_parameters(mail.gaussians.features_rest)
+                counted += 0 if migrants is None else count_parameters(migrants.gaussians.features_rest)
         return counted
 
     def bounds(self, block: int) -> Box | None:

@@ -10,13 +10,13 @@ BlockName = int | str
 
 WHOLE = "whole"
 """All blocks at once, where a visit names its block; nothing is stored under it."""
-RESERVE = "reserve"
-"""The Gaussians that wait for the end of the warm-up."""
+DEFERRED = "reserve"
+"""Deferred points: Gaussians that join at the end of the warm-up."""
 LIVE = "live"
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
-INBOX = "inbox"
-"""Gaussians that left their block and wait for the next visit to the one that holds them now."""
+PENDING = "inbox"
+"""Pending migrants: Gaussians that left their block and join another at its next visit."""
 
 
 def initial_of(block: int) -> str:

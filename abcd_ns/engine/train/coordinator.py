@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterable, Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import SweepEnded, VisitEnded
+from abcd_ns.engine.events import EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
-from abcd_ns.engine.store.settle import settle
+from abcd_ns.engine.store.commit import commit
 from abcd_ns.engine.store.special_blocks import LIVE, BlockName
 from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.step.active_block import ActiveBlock
 from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered, Sample, Target
-from abcd_ns.engine.train.step.last_shedding import LastShedding
-from abcd_ns.engine.train.step.live_block import LiveBlock
+from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
@@ -41,7 +41,7 @@ class Coordinator(Trainer):
     Args:
         visits: decides which; None for ABCD's own.
         source: gives visits their layers; None for the run's scene, and little room.
-        target: gives what a sample is trained on; needed where poses are refined, and for a last shedding.
+        target: gives what a sample is trained on; needed where poses are refined, and for a final pruning.
         live: the block in training; None for one that nobody else looks after.
     """
 
@@ -51,7 +51,7 @@ class Coordinator(Trainer):
         visits: Visits | None = None,
         source: LayerSource | None = None,
         target: Callable[[Sample], Target] | None = None,
-        live: LiveBlock | None = None,
+        live: ActiveBlock | None = None,
     ) -> None:
         super().__init__(run)
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
@@ -59,7 +59,7 @@ class Coordinator(Trainer):
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
-        self._last = None if target is None else LastShedding(run, target)
+        self._final_pruning = None if target is None else FinalPruning(run, target)
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -122,13 +122,13 @@ class Coordinator(Trainer):
             self.scene.read_ahead(plan.block)
 
     def end_visit(self) -> None:
-        """Put the block to rest, and Gaussians that left it into the inbox; cut what has outgrown a block."""
+        """Put the block to rest, and what left it into pending migrants; cut what has outgrown a block."""
         active = self.run.active
         state = self.visit.finish()
         if active.is_whole:
             self._end_warm_up()
-        self.visit.live.let_go()  # a worker, or the next survey, may need the device's memory
-        updates = settle(self.scene, active.geometry.block, state, self.config.recipe.migrate)
+        self.visit.live.let_go()  # a worker, or the next footprints, may need the device's memory
+        updates = commit(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
             updates[LIVE] = state.nobody
         self.scene.clear_live()
@@ -136,7 +136,7 @@ class Coordinator(Trainer):
         crash_points.reached(crash_points.VISIT_TRAINED)
         rest_after_visit(self.run, active, state, updates, self.state.sweep)
         if not active.is_whole and not self.state.queue:
-            self.announce(SweepEnded(self.state.sweep, self.state.step))
+            self.announce(EpochEnded(self.state.sweep, self.state.step))
 
     def complete(self) -> None:
         """Take out what the complete run's pictures hardly miss, where options ask for it and there are
@@ -144,9 +144,13 @@ class Coordinator(Trainer):
         visit that is under way, as where a run goes on for no more steps, ends."""
         if self.state.active is not None:
             self.end_visit()
-        if self.state.shed_at == self.state.step or self._last is None or not self._last.is_wanted:
+        if (
+            self.state.shed_at == self.state.step
+            or self._final_pruning is None
+            or not self._final_pruning.is_wanted
+        ):
             return
-        self._last.take()
+        self._final_pruning.run()
         self.state.shed_at = self.state.step
         self.run.rest(self.scene.tree, {}, 0.0)
 
@@ -210,7 +214,7 @@ def rest_after_visit(
     Args:
         state: what the visit made of its block.
         updates: what comes to rest of it.
-        sweep: that it belongs to.
+        epoch: that it belongs to.
     """
     tree, parts = cut_full(run.scene, updates, run.state, run.config.limits, run.announce)
     if active.is_joint and tree.num_blocks > 1:

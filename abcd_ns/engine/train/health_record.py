@@ -1,4 +1,4 @@
-"""What is known of each block's health: counts of what was mended, and its standing in words."""
+"""What is known of each block's health: counts of what was repaired, and its standing in words."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class BlockHealth:
     """In the last visit no picture showed the block."""
 
 
-Ledger = dict[BlockName, BlockHealth]
+HealthByBlock = dict[BlockName, BlockHealth]
 """By block; special_blocks.WHOLE for the warm-up. A block that was never visited is missing."""
 
 
@@ -52,16 +52,16 @@ def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -
     return "trained"
 
 
-def summary(blocks: int, ledger: Ledger, views: Mapping[int, int]) -> list[str]:
-    """Lines for the end of a run: how the blocks stand, and what had to be mended. Blocks count from 1."""
+def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int]) -> list[str]:
+    """Lines for the end of a run: how the blocks stand, and what had to be repaired. Blocks count from 1."""
     by_standing: dict[str, list[int]] = {}
     for block in range(blocks):
-        by_standing.setdefault(standing(block, ledger.get(block), views), []).append(block + 1)
+        by_standing.setdefault(standing(block, health_by_block.get(block), views), []).append(block + 1)
     if list(by_standing) == ["trained"]:
         lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
     else:
         lines = [f"{_named(members)}: {words}" for words, members in by_standing.items()]
-    return lines + _mended(ledger.values())
+    return lines + _repaired(health_by_block.values())
 
 
 def _named(blocks: list[int]) -> str:
@@ -70,18 +70,18 @@ def _named(blocks: list[int]) -> str:
     return f"{word} {shown}"
 
 
-MENDED = {
+REPAIRED = {
     "gradients": "gradients that were no numbers set to zero",
     "moments": "moments that were no numbers set to zero",
     "values": "Gaussians that were no numbers replaced",
-    "giants": "giants shrunk",
+    "giants": "oversized Gaussians shrunk",
     "shed": "Gaussians taken out that filled too little of their views",
 }
 """What the counts of a BlockHealth say."""
 
 
-def _mended(records: Iterable[BlockHealth]) -> list[str]:
+def _repaired(records: Iterable[BlockHealth]) -> list[str]:
     records = list(records)
-    totals = {name: sum(getattr(record, name) for record in records) for name in MENDED}
-    found = [f"{total:,} {MENDED[name]}" for name, total in totals.items() if total]
+    totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
+    found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
     return [", ".join(found)] if found else []

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from abcd_ns.engine.events import LayersDrawn
+from abcd_ns.engine.layers.layer_renderer import PARTS_BYTES, LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
-from abcd_ns.engine.layers.painter import PARTS_BYTES, Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.memory import free_bytes, needs_of
@@ -53,12 +53,12 @@ class LayerSource:
             return None
         painted = list(run.views.values())
         layers = VisitLayers(
-            painter_of(run, self._around(), painted),
+            renderer_of(run, self._around(), painted),
             LayerStore(run.device, self.room.device, self.room.ram),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),
             run.views,
-            PaintSettings(active.sh_degree, config.antialiased),
+            RenderSettings(active.sh_degree, config.antialiased),
             window_weight=config.recipe.window_weight,
             parts_bytes=parts_bytes(run, painted, blocks=2),
         )
@@ -68,13 +68,13 @@ class LayerSource:
         return layers
 
 
-def painter_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> Painter:
+def renderer_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> LayerRenderer:
     """What draws a scene as the run's options have it.
 
     Args:
         scene: the run's, or what it would be.
     """
-    return Painter(
+    return LayerRenderer(
         scene,
         views,
         run.rasterizer,
@@ -85,7 +85,7 @@ def painter_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> Painte
 
 
 def parts_bytes(run: TrainingRun, views: Iterable[View], blocks: int, share: float = 1.0) -> int:
-    """Size of the layers that may be held while units are folded.
+    """Size of the layers that may be held while nodes are folded.
 
     Args:
         blocks: that steps train by, one or several.

@@ -12,7 +12,7 @@ import psutil
 import torch
 
 from abcd_ns.engine.gaussians.spherical_harmonics import NUMBERS_WITHOUT_COLOR
-from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, LEAST_PASS, PARTS_BYTES
+from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LEAST_PASS, PARTS_BYTES
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
@@ -123,7 +123,7 @@ class DeviceNeeds:
         return (self.left(budget) - self.fixed_bytes) // self.gaussian_bytes
 
 
-def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
+def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
     """Gaussians of the warm-up: where not given, as many as take no more than a visit to a block does.
 
     Args:

@@ -6,11 +6,11 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
-from abcd_ns.engine.layers.survey import VisitGeometry, survey
+from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
-from abcd_ns.engine.store.settle import has_scaffold
-from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
+from abcd_ns.engine.store.commit import has_coarse_model
+from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
@@ -18,7 +18,7 @@ from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, Vis
 from abcd_ns.engine.train.schedule import (
     VisitPlan,
     passes_of_visit,
-    plan_sweep,
+    plan_epoch,
     views_per_step,
     views_per_visit,
     visit_views,
@@ -30,7 +30,7 @@ from abcd_ns.errors import UserError
 DOUBTED = 8
 """Views that hardly show a block, as far as known, of which a visit looks at the first that sees it."""
 LOOK_AGAIN = 4
-"""Blocks that were hidden behind others are looked at again every so many sweeps."""
+"""Blocks that were hidden behind others are looked at again every so many epochs."""
 
 
 class NothingSeenError(UserError, RuntimeError):
@@ -74,14 +74,14 @@ class Visits(Protocol):
 
 
 def views_of_step(config: TrainingConfig, blocks: int, trained: int) -> int:
-    """Views in a step of a block that was trained on so many, one of several: fewer while it is young, where
-    its steps are larger for that."""
+    """Views in a step of a block that was trained on so many, one of several: fewer while it is
+    under-trained, where its steps are larger for that."""
     known = trained if config.recipe.fast_start else None
     return views_per_step(config.batch, blocks, config.limits.batch_limit, known)
 
 
 class Planner(Visits):
-    """ABCD's visits: sweeps over all blocks that any view sees, after a warm-up; all that it remembers is in
+    """ABCD's visits: epochs over all blocks that any view sees, after a warm-up; all that it remembers is in
     the run's state."""
 
     def __init__(self, run: TrainingRun) -> None:
@@ -94,11 +94,11 @@ class Planner(Visits):
         passed over, and most of the time those that no picture showed when they were last visited.
 
         Raises:
-            BlocksBusyError: the blocks that are left in this sweep are in flight.
+            BlocksBusyError: the blocks that are left in this epoch are in flight.
         """
         run, state = self._run, self._run.state
         began = run.stopwatch.seconds
-        if state.visit == 0 and has_scaffold(self._scene) and run.progress < self._config.warmup:
+        if state.visit == 0 and has_coarse_model(self._scene) and run.progress < self._config.warmup:
             state.active = self._warm_up(run.sh_degree, began)
         else:
             state.active = self._next_visit(state, run.sh_degree, began, at_once)
@@ -109,13 +109,13 @@ class Planner(Visits):
         """What the limits of scene and block leave; in the warm-up what the memory of a visit holds."""
         run, live = self._run, len(self._run.params["means"])
         if run.active.is_whole:
-            waiting, limit = self._scene.rows(RESERVE), self._config.density.limit
+            deferred, limit = self._scene.rows(DEFERRED), self._config.density.limit
             most = self._config.limits.scaffold_gaussians
-            return (most if limit is None else min(most, limit - waiting)) - live
+            return (most if limit is None else min(most, limit - deferred)) - live
         return self._config.room(run.count(), live, run.blocks)
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
-        """The visit in which the scaffold of all blocks is trained."""
+        """The visit in which the coarse model of all blocks is trained."""
         crops = {index: view.full for index, view in self._run.views.items()}
         geometry = VisitGeometry(WHOLE, crops)
         return ActiveVisit(0, VisitKind.COARSE, geometry, sh_degree, UNLIMITED, geometry.views, began=began)
@@ -127,7 +127,7 @@ class Planner(Visits):
             # Where nothing is known, or what shows the block has changed, all views are asked.
             known = self._known_to_show(state, plan.block, views)
             active = self._visit(state, plan, views, known, sh_degree) or self._visit(
-                state, plan, views, self._survey(plan.block, views).views, sh_degree
+                state, plan, views, self._footprints(plan.block, views).views, sh_degree
             )
             if active is not None:
                 active.began = began
@@ -159,7 +159,7 @@ class Planner(Visits):
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
         asked = {view: views[view] for view in (*chosen, *doubted)}
-        found = self._survey(block, asked, self._config.recipe.influence_share)
+        found = self._footprints(block, asked, self._config.recipe.influence_share)
         chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
         if not chosen:
             return None
@@ -197,15 +197,15 @@ class Planner(Visits):
 
     def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
         while not state.queue:
-            self._plan_sweep(state, at_once)
+            self._plan_epoch(state, at_once)
         busy = sorted({visit.geometry.block for visit in state.in_flight})
         free = [place for place, plan in enumerate(state.queue) if plan.block not in busy]
         if not free:
             raise BlocksBusyError
         return state.queue.pop(min(free, key=lambda k: overlap(state.influence, state.queue[k].block, busy)))
 
-    def _plan_sweep(self, state: RunState, at_once: int) -> None:
-        """Queue the visits of the next sweep; none where all that are seen are hidden behind others."""
+    def _plan_epoch(self, state: RunState, at_once: int) -> None:
+        """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
         config = self._config
         if not state.views:
             state.views = self._views_of_blocks(state)
@@ -224,12 +224,12 @@ class Planner(Visits):
         steps = (passes, remaining, config.seed, config.recipe.visit_steps)
         clocks = self._scene.clocks
         batches = {block: views_of_step(config, blocks, clocks(block).adam_views) for block in used}
-        state.queue = list(plan_sweep(state.sweep, used, *steps, batches))
+        state.queue = list(plan_epoch(state.sweep, used, *steps, batches))
 
     def _look_at_arrivals(self, state: RunState) -> None:
         """A block that no view saw may be seen once others have come into it."""
         for block, seen in state.views.items():
-            if not seen and self._scene.mail(block) is not None:
+            if not seen and self._scene.pending_for(block) is not None:
                 state.views[block] = self._views_that_see(block)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
@@ -241,7 +241,7 @@ class Planner(Visits):
         return views
 
     def _views_that_see(self, block: int) -> int:
-        return len(self._survey(block, self._may_see(block)).views)
+        return len(self._footprints(block, self._may_see(block)).views)
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
@@ -261,8 +261,8 @@ class Planner(Visits):
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 
-    def _survey(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
+    def _footprints(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
         if not views:
             return VisitGeometry(block, {})
         gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
-        return survey(gaussians, block, views.values(), self._run.rasterizer, share)
+        return footprints(gaussians, block, views.values(), self._run.rasterizer, share)

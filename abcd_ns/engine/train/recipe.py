@@ -56,8 +56,8 @@ class Recipe:
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Mean absolute difference, as 3DGS, or mean squared difference, as the paper with `ssim_lambda` 0."""
     fast_start: bool = True
-    """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
-    fall at the end of the run, see `schedule.settling`."""
+    """Learning rates are larger while a block was trained on few views, see
+    `param_swap.rates_of_under_trained`, and fall at the end of the run, see `schedule.final_decay`."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Limits:
     """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
     another one each time, and weighs it by how much of the crop it leaves out."""
     scaffold_gaussians: int = 0
-    """Gaussians of the warm-up's scaffold at most, see `memory.scaffold_size`; 0 is as many as there are in
-    the beginning."""
+    """Gaussians of the warm-up's coarse model at most, see `memory.coarse_model_size`; 0 is as many as there
+    are in the beginning."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
-from abcd_ns.engine.layers.survey import VisitGeometry
+from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
 from abcd_ns.engine.store.special_blocks import from_text
-from abcd_ns.engine.train.health_record import BlockHealth, Ledger
+from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
@@ -131,7 +131,7 @@ class RunState:
     visit: int = 0
     """Visits begun so far."""
     queue: list[VisitPlan] = field(default_factory=list)
-    """Visits of this sweep still to come."""
+    """Visits of this epoch still to come."""
     views: dict[int, int] = field(default_factory=dict)
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)
@@ -143,9 +143,9 @@ class RunState:
     posed: float = 0.0
     """Uses after which poses were last refined."""
     shed_at: int = -1
-    """Steps after which the last shedding was done."""
-    health: Ledger = field(default_factory=dict)
-    """What had to be mended, by block."""
+    """Steps after which the final pruning was done."""
+    health: HealthByBlock = field(default_factory=dict)
+    """What had to be repaired, by block."""
     active: ActiveVisit | None = None
     in_flight: list[ActiveVisit] = field(default_factory=list)
     """Visits that workers are at, in the order in which they began. Who goes on from here plans them
@@ -163,7 +163,7 @@ class RunState:
         for known in (self.views, self.influence):
             if parent in known:
                 known[new] = copy.copy(known[parent])
-        if (record := self.health.get(parent)) is not None:  # what was mended is counted once
+        if (record := self.health.get(parent)) is not None:  # what was repaired is counted once
             self.health[new] = BlockHealth(visits=record.visits)
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
@@ -171,8 +171,8 @@ class RunState:
 
     def to_json(self) -> dict[str, Any]:
         """As JSON, which shares nothing with this state; `from_json` gives an equal one."""
-        lent = [VisitPlan(v.geometry.block, v.steps, v.batch) for v in self.in_flight]
-        return msgspec.to_builtins(replace(self, queue=lent + self.queue, in_flight=[]), str_keys=True)
+        assigned = [VisitPlan(v.geometry.block, v.steps, v.batch) for v in self.in_flight]
+        return msgspec.to_builtins(replace(self, queue=assigned + self.queue, in_flight=[]), str_keys=True)
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":

@@ -1,6 +1,6 @@
 """Which block next, for how many steps, on which views: pure functions of integers.
 
-There is one step budget for the whole scene. A sweep visits every block that some view sees; what its steps
+There is one step budget for the whole scene. An epoch visits every block that some view sees; what its steps
 draw is proportional to the number of those views, as in joint training (docs/design.md: blocks that few
 views see overfit otherwise).
 """
@@ -15,11 +15,11 @@ T = TypeVar("T")
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks, of one that was trained on many views."""
-YOUNG = 500
+UNDER_TRAINED = 500
 """Views that a block was trained on when a visit is planned, the warm-up's included, below which its steps
-draw one; two below twice as many, and so on. A young block's steps are as large whatever they draw, see
-`rates_of_young`: so there are more of them."""
-SCAFFOLD_PASSES = 24
+draw one; two below twice as many, and so on. An under-trained block's steps are as large whatever they draw,
+see `rates_of_under_trained`: so there are more of them."""
+COARSE_MODEL_PASSES = 24
 """Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
 soon are as good as they can be. Elsewhere it goes on until then, for ..."""
 LONGER = 2
@@ -34,7 +34,7 @@ FEW_VIEWS = 32
 SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
-SETTLES, SETTLED, SETTLING_VIEWS = 0.6, 0.1, 1000
+DECAY_BEGINS, DECAYED_TO, DECAY_VIEWS = 0.6, 0.1, 1000
 """From this share of a run on learning rates fall, to this share of them where a block was trained on so many
 views, the warm-up's included: one that saw fewer is on its way yet."""
 
@@ -48,24 +48,24 @@ class VisitPlan(NamedTuple):
     """Views in each step; 0 for as many as steps have at most."""
 
 
-def warm_up_is_over(progress: float, uses: float, share: float, waiting: int) -> bool:
-    """Whether the scaffold has been trained for long enough.
+def warm_up_is_over(progress: float, uses: float, share: float, deferred: int) -> bool:
+    """Whether the coarse model has been trained for long enough.
 
     Args:
         progress: share of the run that is done.
         uses: of each view so far.
         share: of the run, for the warm-up: `TrainingConfig.warmup`.
-        waiting: Gaussians that had no room in the scaffold.
+        deferred: Gaussians that had no room in the coarse model.
     """
-    if waiting:
-        return warmed(progress, uses, share, waiting) >= 1
-    return progress >= share and (uses >= SCAFFOLD_PASSES or progress >= LONGER * share)
+    if deferred:
+        return warmed(progress, uses, share, deferred) >= 1
+    return progress >= share and (uses >= COARSE_MODEL_PASSES or progress >= LONGER * share)
 
 
-def warmed(progress: float, uses: float, share: float, waiting: int) -> float:
+def warmed(progress: float, uses: float, share: float, deferred: int) -> float:
     """The share of the shortest warm-up that there may be which is done; see `warm_up_is_over`."""
     done = progress / share if share > 0 else 1.0
-    return max(done, uses / SCAFFOLD_PASSES) if waiting else done
+    return max(done, uses / COARSE_MODEL_PASSES) if deferred else done
 
 
 def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
@@ -81,7 +81,7 @@ def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
     return alone / (1 + (SHORTER - 1) * unseen)
 
 
-def plan_sweep(
+def plan_epoch(
     sweep: int,
     views: Mapping[int, int],
     passes: int | float,
@@ -90,13 +90,13 @@ def plan_sweep(
     each: int = 0,
     batches: Mapping[int, int] | None = None,
 ) -> tuple[VisitPlan, ...]:
-    """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
+    """The visits of one epoch, in a random order that depends on `seed` and `sweep` alone.
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
         passes: how often a visit uses each of its views.
-        remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
-            or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
+        remaining: steps left in the budget, or None without one. Where they do not suffice for the epoch,
+            or would leave less than half an epoch behind, all visits are scaled to use up exactly these.
         each: steps of every visit, whatever its views; 0 shares them out by views.
         batches: by block, the views that a step draws; 1 where it is missing.
     """
@@ -125,7 +125,7 @@ def views_per_step(batch: int, blocks: int, limit: int = 0, trained: int | None 
     if batch:
         return batch
     most = 1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH)
-    return most if trained is None else min(most, 1 << (trained // YOUNG).bit_length())
+    return most if trained is None else min(most, 1 << (trained // UNDER_TRAINED).bit_length())
 
 
 def evenly(values: Sequence[T], wanted: int) -> list[T]:
@@ -185,10 +185,10 @@ def exponential_decay(progress: float, final: float) -> float:
     return final ** min(max(progress, 0.0), 1.0)
 
 
-def settling(progress: float, views: int) -> float:
-    """The share of learning rates that is left, see SETTLES, to a block that was trained on so many views."""
-    fallen = exponential_decay((progress - SETTLES) / (1 - SETTLES), SETTLED)
-    return fallen ** min(views / SETTLING_VIEWS, 1.0)
+def final_decay(progress: float, views: int) -> float:
+    """The share of the learning rates left to a block that was trained on so many views, see DECAY_BEGINS."""
+    fallen = exponential_decay((progress - DECAY_BEGINS) / (1 - DECAY_BEGINS), DECAYED_TO)
+    return fallen ** min(views / DECAY_VIEWS, 1.0)
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:

@@ -13,9 +13,9 @@ from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
-from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, gradients_of
-from abcd_ns.engine.train.density.shedding import PASSES, weighed
+from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Visits
@@ -24,11 +24,12 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.schedule import (
     endless_order,
     exponential_decay,
-    settling,
+    final_decay,
     view_order,
     views_per_step,
     warm_up_is_over,
 )
+from abcd_ns.engine.train.step.active_block import ActiveBlock
 from abcd_ns.engine.train.step.batch import (
     COMING,
     Backgrounds,
@@ -38,7 +39,6 @@ from abcd_ns.engine.train.step.batch import (
     Sample,
     part_to_draw,
 )
-from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.residuals import Residuals
 from abcd_ns.engine.types import Crop, View
 
@@ -57,10 +57,10 @@ class VisitTraining:
         run: TrainingRun,
         visits: Visits,
         source: LayerSource,
-        live: LiveBlock | None = None,
+        live: ActiveBlock | None = None,
     ) -> None:
         self.run, self._visits, self._source = run, visits, source
-        self.live = LiveBlock(run) if live is None else live  # one that is empty yet is false
+        self.live = ActiveBlock(run) if live is None else live  # one that is empty yet is false
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
@@ -117,9 +117,9 @@ class VisitTraining:
         run = self.run
         decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
-        settles = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)
+        decays = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
-        damping = settling(run.progress, trained) if settles else 1.0
+        damping = final_decay(run.progress, trained) if decays else 1.0
         self._pace.set(self.batch, trained, decay, damping)
         step, first = run.state.step, run.active.done * self.batch
         views = self._views_of(range(first, first + self.batch + COMING))
@@ -171,7 +171,7 @@ class VisitTraining:
         self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.live.judge()
-            self.live.hold_back_giants()
+            self.live.shrink_oversized()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
@@ -206,15 +206,15 @@ class VisitTraining:
         run, active = self.run, self.run.active
         if not active.is_whole:
             return False
-        uses, waiting = active.done * self.batch / len(active.views), run.scene.rows(RESERVE)
-        return warm_up_is_over(run.progress, uses, run.config.warmup, waiting)
+        uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
+        return warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
 
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
         if not active.is_all:
             self.live.judge()
-        self.live.hold_back_giants()
+        self.live.shrink_oversized()
         if not active.is_whole:
             self.live.count_visit()
         state = self.run.health.end_visit(active, self.live.detached)
@@ -264,7 +264,7 @@ class VisitTraining:
             [sample.shot for sample in samples],
             sh_degree=self.degree,
             antialiased=run.config.antialiased,
-            weigh=run.density.weighs,
+            blend_weights=run.density.wants_weights,
             judge=self._asks,
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
@@ -280,13 +280,13 @@ class VisitTraining:
     def _pictures(
         self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]
     ) -> tuple[Tensor, ...]:
-        weigh = self.run.density.weighs
+        blend_weights = self.run.density.wants_weights
         if all(light is None for light in lights):
-            found = pictures_of(rasters, [sample.frame(weigh) for sample in samples])
+            found = pictures_of(rasters, [sample.frame(blend_weights) for sample in samples])
             if found is not None:
                 return found
         drawn = zip(samples, rasters, lights, strict=True)
         return tuple(
-            s.picture(weighed(raster, s.in_front, s.share) if weigh else raster, light)
+            s.picture(with_blend_weights(raster, s.in_front, s.share) if blend_weights else raster, light)
             for s, raster, light in drawn
         )

@@ -53,7 +53,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
     memory = memory_of_run()
     coordinator.close()
     last = [e.psnr for _, e in steps if e.visit == steps[-1][1].visit and math.isfinite(e.psnr)]
-    usual = visits[1:] or visits  # the first one's time holds the planning of the sweep
+    usual = visits[1:] or visits  # the first one's time holds the planning of the epoch
     return Run(
         method=job.method,
         scene="terrain",

@@ -20,12 +20,12 @@ from abcd_ns.engine.space.near_plane import as_trained
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import scaffold_size
+from abcd_ns.engine.train.memory import coarse_model_size
 from abcd_ns.engine.train.planner import views_of_step
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
@@ -143,11 +143,11 @@ class Lab:
         store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
         warms = config.warmup > 0 and tree.num_blocks > 1
         largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
-        keep = scaffold_size(config, largest, pixels) if warms else None
+        keep = coarse_model_size(config, largest, pixels) if warms else None
         config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        waiting = 0 if keep is None else max(len(start) - keep, 0)
-        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), waiting))
+        deferred = 0 if keep is None else max(len(start) - keep, 0)
+        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), deferred))
         live = nothing_live(start.sh_degree)
         return Coordinator(
             TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live)
@@ -213,11 +213,11 @@ class Lab:
         return float(torch.stack(errors).mean())
 
 
-def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiting: int = 0) -> int:
+def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, deferred: int = 0) -> int:
     """Steps that draw about so many views of `views`, in the warm-up and after it.
 
     Args:
-        waiting: Gaussians that have no room in the warm-up.
+        deferred: Gaussians that have no room in the warm-up.
     """
     batch_warm = views_per_step(config.batch, 1)
 
@@ -228,7 +228,7 @@ def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiti
             return drawn_by_blocks(steps, config, blocks, 0)
         uses, share = batch_warm / views, config.warmup
         taken = range(1, steps)
-        is_over = (warm_up_is_over(step / steps, step * uses, share, waiting) for step in taken)
+        is_over = (warm_up_is_over(step / steps, step * uses, share, deferred) for step in taken)
         warm = next((step for step, over in zip(taken, is_over, strict=True) if over), steps)
         return warm * batch_warm + drawn_by_blocks(steps - warm, config, blocks, warm * batch_warm)
 

@@ -1,4 +1,5 @@
-"""A3, A5 to A7, A13, A14, A19, A23: giants, growth, old layers, seams, the number of blocks, fog."""
+"""A3, A5 to A7, A13, A14, A19, A23: oversized Gaussians, growth, old layers, seams, the number of blocks,
+fog."""
 
 import math
 from dataclasses import replace
@@ -17,7 +18,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
-from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE
+from abcd_ns.engine.train.health.health_rules import OVERSIZED_ANGLE
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
@@ -36,10 +37,10 @@ from abcd_ns.lab.stability.lab import (
 from abcd_ns.lab.world.world import Surfaces, Wall, World, camera, ring
 
 SIGMAS = (1.0, 3.0, 10.0)
-"""Of the giants that are put in, in extents of their cell."""
+"""Of the oversized Gaussians that are put in, in extents of their cell."""
 
 
-def with_giants(start: Gaussians, tree: BlockTree) -> Gaussians:
+def with_oversized(start: Gaussians, tree: BlockTree) -> Gaussians:
     """`start` with the Gaussian amid each of the first blocks so many extents wide."""
     owner, scales, opacities = tree.assign(start.means), start.scales.clone(), start.opacities.clone()
     for block, sigma in enumerate(SIGMAS):
@@ -55,7 +56,7 @@ def with_giants(start: Gaussians, tree: BlockTree) -> Gaussians:
 def largest_share(gaussians: Gaussians, views: list[View]) -> float:
     """The largest standard deviation, as a share of what a Gaussian of its distance may have."""
     nearest = torch.cdist(gaussians.means, torch.stack([view.center for view in views])).amin(dim=1)
-    return float((gaussians.scales.amax(dim=1).exp() / (GIANT_ANGLE * nearest)).max())
+    return float((gaussians.scales.amax(dim=1).exp() / (OVERSIZED_ANGLE * nearest)).max())
 
 
 @scenario(
@@ -65,10 +66,10 @@ def largest_share(gaussians: Gaussians, views: list[View]) -> float:
     "shrunk by a block's refinements, none over 1.25 of what is allowed",
 )
 def giants(lab: Lab) -> Finding:
-    """A3: three giants among the first Gaussians; two sweeps, so that each block is refined once."""
+    """A3: three oversized Gaussians at the start; two epochs, so that each block is refined once."""
     stage = make_stage(views=ring(12), points=400)
     tree = build_kd(stage.start().means, BLOCKS)
-    start = with_giants(stage.start(), tree)
+    start = with_oversized(stage.start(), tree)
     before, said = largest_share(start, stage.views), {}
     numbers = {"largest before": before}
     usual = {"start": start, "budget": 320}

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.nerfstudio.run.stopping import command_to_go_on
+from abcd_ns.nerfstudio.run.stopping import command_to_resume
 
 
 def next_steps(trainer: Trainer, method: str, data: Path, checkpoints: Path) -> list[str]:
@@ -25,7 +25,7 @@ def next_steps(trainer: Trainer, method: str, data: Path, checkpoints: Path) -> 
         "Look around in the scene:": shlex.join(["ns-viewer", "--load-config", str(run / "config.yml")]),
         "A file for other viewers:": shlex.join(["abcd", "export", str(run), "--out", "scene.ply"]),
     }
-    longer = command_to_go_on(sys.argv, method, checkpoints, _doubled(trainer))
+    longer = command_to_resume(sys.argv, method, checkpoints, _doubled(trainer))
     if longer is not None:
         why = f" {missed} of {blocks} blocks were not visited." if missed and state.visit else ""
         steps[f"Train twice as long.{why}"] = longer

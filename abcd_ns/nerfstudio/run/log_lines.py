@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from abcd_ns.engine.events import ShedAtEnd, SweepEnded, VisitBegan, WorkerLost
+from abcd_ns.engine.events import EpochEnded, PrunedAtEnd, VisitBegan, WorkerLost
 
 SCHEMA = 1
 """Raised whenever a line changes its form or meaning."""
@@ -79,12 +79,12 @@ def layer_share(visits: Iterable[VisitEndLine]) -> float:
 
 
 @dataclass(frozen=True)
-class SweepEndLine(SweepEnded, Line):
+class EpochEndLine(EpochEnded, Line):
     """Every block that some view sees was visited once more."""
 
 
 @dataclass(frozen=True)
-class ShedAtEndLine(ShedAtEnd, Line):
+class PrunedAtEndLine(PrunedAtEnd, Line):
     """The run was complete, and what its pictures hardly miss was taken out."""
 
 
@@ -127,13 +127,18 @@ KINDS: dict[str, type[Line]] = {
     "visit": VisitLine,
     "sample": SampleLine,
     "visit end": VisitEndLine,
-    "sweep end": SweepEndLine,
+    "sweep end": EpochEndLine,
     "worker lost": WorkerLostLine,
     "worker": WorkerLine,
-    "shed at end": ShedAtEndLine,
+    "shed at end": PrunedAtEndLine,
     "held out": HeldOutLine,
     "end": EndLine,
 }
 """By the value of a line's field "kind"."""
-KIND_OF = {VisitBegan: "visit", SweepEnded: "sweep end", WorkerLost: "worker lost", ShedAtEnd: "shed at end"}
+KIND_OF = {
+    VisitBegan: "visit",
+    EpochEnded: "sweep end",
+    WorkerLost: "worker lost",
+    PrunedAtEnd: "shed at end",
+}
 """By what of the engine's events is a line as it is."""

@@ -1,4 +1,4 @@
-"""Where the training stands, in the terminal: sweep, block, steps, PSNR, Gaussians, memory, time left."""
+"""Where the training stands, in the terminal: epoch, block, steps, PSNR, Gaussians, memory, time left."""
 
 import math
 import time
@@ -10,20 +10,20 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import Progress, TaskID, TextColumn
 
 from abcd_ns.engine.events import (
+    EpochEnded,
     Event,
     HeldOutScored,
     LayersDrawn,
-    Mended,
-    ShedAtEnd,
-    Shedding,
+    PrunedAtEnd,
+    Pruning,
+    Repaired,
     StepTaken,
-    SweepEnded,
     VisitBegan,
     WorkerLost,
     WorkerSeen,
     WorkersSeen,
 )
-from abcd_ns.engine.train.health_record import MENDED, summary
+from abcd_ns.engine.train.health_record import REPAIRED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
@@ -39,7 +39,7 @@ SMOOTHING = 0.98
 """Of the PSNR shown: the weight of what was there before."""
 
 ALARMING = ("gradients", "moments", "values")
-"""What is said at once when it is mended; the rest is counted and said at the end."""
+"""What is said at once when it is repaired; the rest is counted and said at the end."""
 
 
 class ProgressReport:
@@ -53,7 +53,7 @@ class ProgressReport:
         self._coordinator, self._visits = coordinator, visits
         self._held_out: HeldOutScored | None = None
         self._psnr: float | None = None
-        self._sweep = 0
+        self._epoch = 0
         self._visit: VisitBegan | None = None
         self._workers: tuple[WorkerSeen, ...] = ()
         self._last_line = self._last_look = time.monotonic()
@@ -64,27 +64,27 @@ class ProgressReport:
         """Take note of an event."""
         match event:
             case VisitBegan():
-                self._visit, self._sweep = event, event.sweep
+                self._visit, self._epoch = event, event.sweep
                 self._show("")
             case LayersDrawn():
                 self._show(f"layers {event.done}/{event.total}")
             case StepTaken():
                 self._take_step(event)
-            case SweepEnded() if self._coordinator.scene.tree.num_blocks > 1:
-                self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
+            case EpochEnded() if self._coordinator.scene.tree.num_blocks > 1:
+                self._print(f"epoch {event.sweep} done at step {event.step:,}: {self._summary()}")
             case HeldOutScored():
                 self._held_out = event
-            case Shedding():
+            case Pruning():
                 self._show(f"final pruning {event.done}/{event.total}", event.done / event.total)
-            case ShedAtEnd():
-                self._print(_shed(event))
+            case PrunedAtEnd():
+                self._print(_pruned(event))
             case WorkersSeen():
                 self._workers = event.workers
                 self._show("")
             case WorkerLost():
                 self._print(f"{_block(event.block)}: lost its worker, trained again: {event.why}")
-            case Mended() if event.what in ALARMING:
-                self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
+            case Repaired() if event.what in ALARMING:
+                self._print(f"{_block(event.block)}: {event.count:,} {REPAIRED[event.what]}")
 
     def scalars(self) -> dict[str, float]:
         """Where the training stands, by name, for TensorBoard, wandb and comet.
@@ -95,7 +95,7 @@ class ProgressReport:
         found = {
             "block": 0 if block is None else block + 1,
             "blocks": coordinator.scene.tree.num_blocks,
-            "sweep": self._sweep,
+            "sweep": self._epoch,
             "gaussians": coordinator.count(),
             "share of time for layers": layer_share(self._visits),
             "RAM (GiB)": psutil.Process().memory_info().rss / GIB,
@@ -193,7 +193,7 @@ def fitting(parts: Sequence[str], width: int) -> str:
     return "  ".join(shown)[:width]
 
 
-def _shed(event: ShedAtEnd) -> str:
+def _pruned(event: PrunedAtEnd) -> str:
     before, cost = event.gaussians + event.gone, event.before - event.after
     said = f"Pruned {event.gone:,} of {before:,} Gaussians"
     return f"{said} (costs {cost:.2f} dB on {event.views} training views)." if event.gone else f"{said}."

@@ -15,11 +15,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.photos import Photos
 from abcd_ns.engine.events import (
+    EpochEnded,
     Event,
     HeldOutScored,
-    ShedAtEnd,
+    PrunedAtEnd,
     StepTaken,
-    SweepEnded,
     VisitBegan,
     VisitEnded,
     WorkerLost,
@@ -92,7 +92,7 @@ class RunLog:
                 self._end_visit(event)
             case WorkersSeen():
                 self._workers = event.workers
-            case VisitBegan() | SweepEnded() | WorkerLost() | ShedAtEnd():
+            case VisitBegan() | EpochEnded() | WorkerLost() | PrunedAtEnd():
                 self._note(KIND_OF[type(event)], **vars(event))
                 self._flush()
             case HeldOutScored():

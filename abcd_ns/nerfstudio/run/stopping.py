@@ -93,7 +93,7 @@ class StopSignals:
         self._before = {}
 
 
-def command_to_go_on(
+def command_to_resume(
     argv: Sequence[str], method: str, folder: Path, changed: Mapping[str, object] | None = None
 ) -> str | None:
     """What to type to go on with the run in `folder`: the same command with --load-dir.

@@ -42,7 +42,7 @@ def line(kind: str, step: int, seconds: float, **fields) -> str:
 
 
 def log_lines() -> list[str]:
-    """A run of three blocks: warm-up, one sweep, no end."""
+    """A run of three blocks: warm-up, one epoch, no end."""
     lines = [line("training", 0, 0.0, **TRAINING)]
     lines.append(line("visit", 0, 0.0, visit=0, block=None))
     lines.append(line("visit end", 10, 4.0, visit=0, block=None, layer_seconds=0.0, visit_seconds=4.0))

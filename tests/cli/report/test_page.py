@@ -21,7 +21,7 @@ from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import RunState
 from tests.cli.report.runs import (

@@ -34,7 +34,7 @@ def assert_same(a: BlockState, b: BlockState) -> None:
             ours, theirs = (getattr(getattr(state, part), name) for state in (a, b))
             assert torch.equal(ours.nan_to_num(7.5), theirs.nan_to_num(7.5)), (part, name)
     assert torch.equal(a.growth["weight"], b.growth["weight"])
-    assert torch.equal(a.waits, b.waits)
+    assert torch.equal(a.deferred, b.deferred)
     assert a.clocks == b.clocks
 
 

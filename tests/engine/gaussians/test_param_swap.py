@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import (
-    YOUNG_RATES,
+    UNDER_TRAINED_RATES,
     Pace,
     adam_step,
     attach,
     detach,
     nothing_live,
-    rates_of_young,
+    rates_of_under_trained,
 )
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
@@ -46,9 +46,9 @@ def test_views_that_agree_come_as_far_together_as_one_by_one(views):
 
 @given(views=st.integers(0, 10**6), more=st.integers(0, 10**6), batch=st.integers(1, 8))
 def test_rates_fall_from_four_times_to_what_was_given(views, more, batch):
-    assert rates_of_young(0, batch) == max(YOUNG_RATES / batch, 1.0)
-    assert 1.0 <= rates_of_young(views + more, batch) <= rates_of_young(views, batch)
-    assert rates_of_young(10**6, batch) == 1.0
+    assert rates_of_under_trained(0, batch) == max(UNDER_TRAINED_RATES / batch, 1.0)
+    assert 1.0 <= rates_of_under_trained(views + more, batch) <= rates_of_under_trained(views, batch)
+    assert rates_of_under_trained(10**6, batch) == 1.0
 
 
 @pytest.mark.parametrize(

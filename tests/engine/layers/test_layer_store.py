@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers import visit_layers as visit
+from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Layer

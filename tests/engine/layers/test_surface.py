@@ -1,9 +1,9 @@
-"""Normals and median depth of a whole scene, at once and unit by unit."""
+"""Normals and median depth of a whole scene, at once and node by node."""
 
 import pytest
 import torch
 
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -17,15 +17,15 @@ from tests.reference.scenes import random_gaussians, ring_of_views
 
 SCENE = random_gaussians(60, size=0.2, dtype=torch.float64)
 VIEWS = ring_of_views(3, dtype=torch.float64)
-SETTINGS = PaintSettings(sh_degree=0)
+SETTINGS = RenderSettings(sh_degree=0)
 PRIMITIVES = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 
 
-def painter_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gaussians) -> Painter:
+def renderer_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gaussians) -> LayerRenderer:
     scene = ChangedScene(MemoryScene(build_kd(SCENE.means, 4), SCENE), lambda _, found: keep(found))
     rasterizer = TorchRasterizer(primitive=primitive)
     options = {"ownership": "fragments", "pass_gaussians": pass_gaussians}
-    return Painter(scene, VIEWS, rasterizer, **options)
+    return LayerRenderer(scene, VIEWS, rasterizer, **options)
 
 
 def fragments_at(alone: list[Raster], x: int, y: int) -> list[tuple[float, int, float]]:
@@ -46,15 +46,17 @@ def facing(k: int, view: View, primitive: str) -> torch.Tensor:
 
 def drawn(primitive: str, view: View, pass_gaussians: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The median depth and the normals of a picture."""
-    depth = median_depth(painter_of(primitive, pass_gaussians), view, SETTINGS)
-    painter = painter_of(primitive, pass_gaussians, lambda g: colored_by_normal(g, view, primitive == "2dgs"))
-    assert (len(painter.units()) == 4) == (pass_gaussians == 0)
-    return depth, normals_in(BlockPictures(painter, view, SETTINGS).everything())
+    depth = median_depth(renderer_of(primitive, pass_gaussians), view, SETTINGS)
+    renderer = renderer_of(
+        primitive, pass_gaussians, lambda g: colored_by_normal(g, view, primitive == "2dgs")
+    )
+    assert (len(renderer.nodes()) == 4) == (pass_gaussians == 0)
+    return depth, normals_in(BlockPictures(renderer, view, SETTINGS).everything())
 
 
 @PRIMITIVES
 def test_both_are_those_of_a_loop_over_fragments(primitive):
-    """Drawn at once, and unit by unit; in pixels all over a picture."""
+    """Drawn at once, and node by node; in pixels all over a picture."""
     view, crossed = VIEWS[1], 0
     ways = [drawn(primitive, view, pass_gaussians) for pass_gaussians in (0, 1000)]
     draw = TorchRasterizer(primitive=primitive)
@@ -74,8 +76,8 @@ def test_both_are_those_of_a_loop_over_fragments(primitive):
 
 
 @PRIMITIVES
-def test_units_give_what_all_at_once_gives(primitive):
+def test_nodes_give_what_all_at_once_gives(primitive):
     for view in VIEWS:
-        whole, parts = (median_depth(painter_of(primitive, n), view, SETTINGS) for n in (1000, 0))
+        whole, parts = (median_depth(renderer_of(primitive, n), view, SETTINGS) for n in (1000, 0))
         assert torch.allclose(whole, parts, atol=1e-9)
         assert float((whole > 0).double().mean()) > 0.2

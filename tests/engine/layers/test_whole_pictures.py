@@ -1,4 +1,4 @@
-"""Whole pictures, drawn unit by unit, and their gradient by the pose."""
+"""Whole pictures, drawn node by node, and their gradient by the pose."""
 
 import weakref
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, Painter, PaintSettings
+from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LayerRenderer, RenderSettings
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
@@ -20,8 +20,10 @@ VIEWS = ring_of_views(3, dtype=torch.float64)
 
 def whole_pictures_of(pass_gaussians: int, *layers_bytes: int) -> WholePictures:
     scene = MemoryScene(build_kd(SCENE.means, 4), SCENE)
-    painter = Painter(scene, VIEWS, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians)
-    return WholePictures(painter, PaintSettings(sh_degree=1), *layers_bytes)
+    renderer = LayerRenderer(
+        scene, VIEWS, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians
+    )
+    return WholePictures(renderer, RenderSettings(sh_degree=1), *layers_bytes)
 
 
 def weights_for(view):

@@ -111,8 +111,8 @@ def test_at_0_front_inside_and_back_are_the_merged_picture(seed, crop):
     span = ZWindow.everything(window.grid, "cpu", torch.float64)
     before, behind = span.before(window), span.behind(window)
     (cut,) = DRAW.cuts(frozen, [CutShot(view, crop, before, window, behind)], sh_degree=0)
-    assert torch.equal(cut.members, cut.members.unique())
-    assert torch.equal(cut.inside.planes, DRAW.project(frozen, view)[cut.members].planes)
+    assert torch.equal(cut.kept_ids, cut.kept_ids.unique())
+    assert torch.equal(cut.inside.planes, DRAW.project(frozen, view)[cut.kept_ids].planes)
     (middle,) = DRAW.draw(active, [Shot(view, crop, cut.inside, window)], sh_degree=0)
     found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, dtype=torch.float64))
     whole = DRAW(everyone, view, sh_degree=0, crop=crop)
@@ -139,7 +139,7 @@ def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypat
         shots.append(CutShot(view, crop, span.before(window), window, span.behind(window)))
     for cut, shot in zip(draw.cuts(frozen, shots, sh_degree=1), shots, strict=True):
         (alone,) = draw.cuts(frozen, [shot], sh_degree=1)
-        assert torch.equal(cut.members, alone.members)
+        assert torch.equal(cut.kept_ids, alone.kept_ids)
         assert torch.equal(cut.inside.planes, alone.inside.planes)
         for side in ("front", "back"):
             found, expected = getattr(cut, side), getattr(alone, side)

@@ -79,7 +79,7 @@ def test_fewer_harmonics_are_taken_as_they_are(sh_degree):
 @BOTH
 def test_several_views_what_each_counts_and_weighs(primitive):
     shots = [Shot(VIEW, VIEW.full), Shot(VIEW, Crop(9, 8, 30, 20)), Shot(VIEW, Crop(40, 0, 43, 61))]
-    for options in ({"judge": True}, {"judge": True, "weigh": True}):
+    for options in ({"judge": True}, {"judge": True, "blend_weights": True}):
         found = []
         for draw in pair(primitive):
             leaves = as_leaves(SCENE)
@@ -87,7 +87,7 @@ def test_several_views_what_each_counts_and_weighs(primitive):
             info = rasters[0].info
             info["sums"].ask([probe(*r.depth.shape, dtype=torch.float32)[..., :4] for r in rasters])
             sum((stacked(r) * probe(*r.depth.shape, dtype=torch.float32)).sum() for r in rasters).backward()
-            more = [info["weights"].grad] if "weigh" in options else []
+            more = [info["weights"].grad] if "blend_weights" in options else []
             more += info["sums"].values.split((1, 3, 3, 3), dim=2)
             found.append([leaves.means.grad, leaves.features_rest.grad, info["means2d"].grad, *more])
         for one, other in zip(*found, strict=True):
@@ -111,8 +111,8 @@ def test_windows_cuts_and_median_depths_are_those_of_torch(primitive):
         assert relative_error(found.color, expected.color) < picture
         assert relative_error(found.transmittance, expected.transmittance) < picture
     # Lists of torch hold what fast ones leave out for leaving no fragment.
-    assert set(one.members.tolist()) <= set(other.members.tolist())
-    assert torch.equal(one.inside.planes, fast.project(SCENE, VIEW, sh_degree=2)[one.members].planes)
+    assert set(one.kept_ids.tolist()) <= set(other.kept_ids.tolist())
+    assert torch.equal(one.inside.planes, fast.project(SCENE, VIEW, sh_degree=2)[one.kept_ids].planes)
     masked = [draw(SCENE, VIEW, crop=crop, z_window=window, sh_degree=0) for draw in (fast, slow)]
     assert relative_error(*map(stacked, masked)) < picture
     one, other = (draw.depth_window(SCENE, VIEW, crop=crop, visible=0.05) for draw in (fast, slow))

@@ -144,7 +144,8 @@ def test_weighing_adds_up_what_gaussians_fill_and_changes_nothing_else(with_froz
 
     plain, leaves = as_leaves(gaussians), as_leaves(gaussians)
     (without,), (raster,) = (
-        EAGER.draw(g, [shot], sh_degree=0, weigh=weigh) for g, weigh in ((plain, False), (leaves, True))
+        EAGER.draw(g, [shot], sh_degree=0, blend_weights=blend_weights)
+        for g, blend_weights in ((plain, False), (leaves, True))
     )
     without.color.sin().sum().backward()
     (raster.color.sin().sum() + (raster.depth * counts).sum()).backward()
@@ -201,7 +202,7 @@ def test_what_cannot_be_seen_leaves_nothing_and_no_gradient_breaks():
         assert not value.grad[:5].any(), name
 
 
-def test_needle_and_giant_gaussians_have_finite_gradients_in_float32():
+def test_needle_and_oversized_gaussian_gaussians_have_finite_gradients_in_float32():
     gaussians = random_gaussians(8, dtype=torch.float32)
     scales = torch.tensor([[-12.0, -12, 3], [6, 6, 6], [-20, -20, -20], [3, -9, -9]]).repeat(2, 1)
     view = small_view(dtype=torch.float32)

@@ -152,7 +152,7 @@ def test_weights_are_those_of_the_torch_backend(backend, with_frozen):
     for rasterizer in (backend, torch_twin(backend)):
         seen = None if frozen is None else rasterizer.project(frozen, VIEW)
         leaves, shot = as_leaves(random_gaussians(40)), Shot(VIEW, Crop(19, 5, 30, 31), seen)
-        (raster,) = rasterizer.draw(leaves, [shot], sh_degree=0, weigh=True)
+        (raster,) = rasterizer.draw(leaves, [shot], sh_degree=0, blend_weights=True)
         (raster.color.square().sum() + (raster.depth * probe(31, 30)[..., 0]).sum()).backward()
         found.append((raster.info["weights"].grad, leaves.means.grad, raster.depth))
     assert float(found[1][0].abs().max()) > 1
@@ -254,7 +254,7 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
 
 
 def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
-    monkeypatch.setattr(gsplat_backend, "SURVEY_BYTES", 2 * gsplat_backend.SURVEYED_BYTES * 12)
+    monkeypatch.setattr(gsplat_backend, "FOOTPRINT_BYTES", 2 * gsplat_backend.BYTES_PER_FOOTPRINT * 12)
     gaussians = random_gaussians(12)
     gaussians.means[0] -= 100
     views = [moved(VIEW, 2.0 * k, width=(70, 50)[k % 2], near=(0.01, 2.0)[k % 3 == 0]) for k in range(-9, 10)]
@@ -279,9 +279,9 @@ def test_cut_is_that_of_the_torch_backend(backend, crop):
         torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
         torch.testing.assert_close(one.transmittance, other.transmittance, rtol=1e-9, atol=1e-10)
     # gsplat's lists are longer: they hold what the square of the radius touches, drawn there or not.
-    assert set(expected.members.tolist()) <= set(found.members.tolist())
-    assert torch.equal(found.members, found.members.unique())
-    torch.testing.assert_close(found.inside.depths, backend.project(gaussians, VIEW).depths[found.members])
+    assert set(expected.kept_ids.tolist()) <= set(found.kept_ids.tolist())
+    assert torch.equal(found.kept_ids, found.kept_ids.unique())
+    torch.testing.assert_close(found.inside.depths, backend.project(gaussians, VIEW).depths[found.kept_ids])
 
 
 @pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
@@ -311,7 +311,7 @@ def test_depth_windows_and_cuts_of_several_views_are_those_of_each(backend):
         shots.append(CutShot(view, crop, every.before(window), window, every.behind(window)))
     for cut, shot in zip(backend.cuts(gaussians, shots, sh_degree=1), shots, strict=True):
         (alone,) = backend.cuts(gaussians, [shot], sh_degree=1)
-        assert torch.equal(cut.members, alone.members)
+        assert torch.equal(cut.kept_ids, alone.kept_ids)
         for layer in ("front", "back"):
             found, expected = getattr(cut, layer), getattr(alone, layer)
             torch.testing.assert_close(found.color, expected.color)

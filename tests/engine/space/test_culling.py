@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.culling import BOUNDS_SLANT, Frusta, Optics, bounds_of, intersection
 from abcd_ns.engine.space.partition import build_kd
@@ -18,7 +18,7 @@ from abcd_ns.engine.types import Crop, Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
-SETTINGS = PaintSettings(sh_degree=1)
+SETTINGS = RenderSettings(sh_degree=1)
 
 
 class Watched(MemoryScene):
@@ -127,9 +127,9 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
     views = ring_of_views(3, dtype=torch.float64)  # around the first cluster
     tree = build_kd(gaussians.means, 8)
     scene = Watched(tree, gaussians)
-    paint = Painter(scene, views, DRAW, ownership=ownership, pass_gaussians=0)
+    renderer = LayerRenderer(scene, views, DRAW, ownership=ownership, pass_gaussians=0)
     for view in views:
-        found = paint.picture(view, SETTINGS)
+        found = renderer.picture(view, SETTINGS)
         expected = DRAW(gaussians, view, sh_degree=1).layer
         assert torch.allclose(found.color, expected.color, atol=1e-12)
         assert torch.allclose(found.transmittance, expected.transmittance, atol=1e-12)
@@ -138,15 +138,15 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
 
 
 @pytest.mark.parametrize("ownership", ["fragments", "means"])
-def test_few_parts_are_held_while_units_are_folded(ownership):
+def test_few_parts_are_held_while_nodes_are_folded(ownership):
     gaussians, views = random_gaussians(128), ring_of_views(1)
     tree = build_kd(gaussians.means, 32)
-    paint = Painter(MemoryScene(tree, gaussians), views, DRAW, ownership=ownership, pass_gaussians=0)
+    renderer = LayerRenderer(MemoryScene(tree, gaussians), views, DRAW, ownership=ownership, pass_gaussians=0)
     for view in views:
         parts, most = {}, 0
-        for unit in paint.units():
-            (parts[unit],) = paint.paint(unit, paint.load(unit), [Seen(view, view.full)], SETTINGS)
-            paint.fold_up(parts, unit, view)
+        for node in renderer.nodes():
+            (parts[node],) = renderer.render(node, renderer.load(node), [Seen(view, view.full)], SETTINGS)
+            renderer.fold_up(parts, node, view)
             most = max(most, len(parts))
         assert list(parts) == [0]
         assert most <= 6  # one for each level of a tree of 32, and the one that came last

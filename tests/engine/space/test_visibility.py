@@ -64,7 +64,7 @@ def test_footprint_is_the_bounds_of_the_pixels_touched(seed, n, margin, align):
     assert footprint_of(means2d, radii, small_view(), margin, align) == expected
 
 
-def test_footprint_of_a_giant_is_the_image():
+def test_footprint_of_an_oversized_gaussian_is_the_image():
     view = small_view()
     crop = footprint_of(torch.tensor([[1e30, 0.0], [20.0, -1e9]]), torch.tensor([0, 2_000_000_000]), view)
     assert crop == view.full

@@ -9,16 +9,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import DRAWN
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore, StoreError, parameter_store
 from abcd_ns.engine.store.block_memory import BlockMemory
-from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.settle import with_mail
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE
+from abcd_ns.engine.store.special_blocks import LIVE, PENDING
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.engine.store.disks import PATIENCE, Disk, on_disk, wait_until
@@ -84,12 +84,12 @@ def test_what_is_not_on_disk_yet_is_counted_under_the_lock(scene):
 @pytest.mark.parametrize(
     "which", [None, lambda means, scales: ((means + scales)[:, 0] * 1000).long() % 2 == 0]
 )
-def test_what_waits_is_left_out_and_mail_is_drawn_picked_or_not(scene, which):
+def test_what_waits_is_left_out_and_pending_migrants_are_drawn_picked_or_not(scene, which):
     state = scene.state(1)
-    waits = torch.arange(len(state)) % 3 == 0
-    mail = BlockState.fresh(state.gaussians[2:5])  # in the block's cell
-    scene.rest(scene.tree, {1: replace(state, waits=waits), INBOX: mail}, {}, within=60.0)
-    seen = Gaussians.cat([state.gaussians[~waits], mail.gaussians])
+    deferred = torch.arange(len(state)) % 3 == 0
+    migrants = BlockState.fresh(state.gaussians[2:5])  # in the block's cell
+    scene.rest(scene.tree, {1: replace(state, deferred=deferred), PENDING: migrants}, {}, within=60.0)
+    seen = Gaussians.cat([state.gaussians[~deferred], migrants.gaussians])
     expected = seen if which is None else seen[which(seen.means, seen.scales)]
     assert which is None or 0 < len(expected) < len(seen)
     assert equal(expected, scene.drawn(1, "cpu", which))
@@ -321,10 +321,10 @@ def test_no_shard_is_read_twice_where_ram_suffices(make, photos, reads):
     reads.clear()
     train(coordinator, photos)
     assert coordinator.state.sweep > 0
-    assert len(reads) == 2 * 3  # their Gaussians for the plan of the sweep; the rest for the first visit
+    assert len(reads) == 2 * 3  # their Gaussians for the plan of the epoch; the rest for the first visit
 
 
-# The inbox
+# The pending migrants
 
 
 def shaken(coordinator, photos) -> None:
@@ -335,7 +335,7 @@ def shaken(coordinator, photos) -> None:
         coordinator.params["means"].add_(0.05 * noise)
 
 
-def test_a_visit_writes_its_block_and_the_inbox_alone(make, photos):
+def test_a_visit_writes_its_block_and_the_pending_migrants_alone(make, photos):
     coordinator = make(blocks=4, steps=60, density=STILL, commit_seconds=0.0)
     disk, ended = Disk(coordinator.scene.store), listen(coordinator, VisitEnded)
     while not coordinator.finished:
@@ -343,28 +343,28 @@ def test_a_visit_writes_its_block_and_the_inbox_alone(make, photos):
     assert sum(event.migrated for event in ended) > 0
     assert len(disk.commits) == len(ended)
     for (written, _), event in zip(disk.commits, ended, strict=True):
-        assert event.block in written <= {event.block, INBOX}
-        assert INBOX in written or event.migrated == 0
+        assert event.block in written <= {event.block, PENDING}
+        assert PENDING in written or event.migrated == 0
 
 
-def test_those_in_the_inbox_are_drawn_survive_a_stop_and_join(make, photos):
+def test_pending_migrants_are_drawn_survive_a_stop_and_join(make, photos):
     options = {"blocks": 2, "steps": 60, "density": STILL}
     coordinator = make(**options)
-    while coordinator.scene.inbox is None or not len(coordinator.scene.inbox):
+    while coordinator.scene.pending is None or not len(coordinator.scene.pending):
         shaken(coordinator, photos)
-    (block,) = coordinator.scene._mail
-    expected, rows = with_mail(coordinator.scene, block), coordinator.scene.rows(block)
+    (block,) = coordinator.scene._pending_by_block
+    expected, rows = with_pending(coordinator.scene, block), coordinator.scene.rows(block)
     assert len(coordinator.scene.gaussians(block)) == coordinator.scene.count(block) == len(expected) > rows
     stop(coordinator)
     again = make(resume=True, **options)
-    assert same(with_mail(again.scene, block), expected)
+    assert same(with_pending(again.scene, block), expected)
     begun = listen(again, VisitBegan)
     while not begun or begun[-1].block != block:
         train_step(again, photos)
     assert begun[-1].gaussians == len(expected)
     while again.state.active is not None:
         train_step(again, photos)
-    assert again.scene.mail(block) is None
+    assert again.scene.pending_for(block) is None
     assert again.scene.clocks(block).visits == expected.clocks.visits + 1
 
 
@@ -378,7 +378,7 @@ def test_one_block_is_one_visit(make, photos):
     (begun,) = (event for event in events if isinstance(event, VisitBegan))
     (ended,) = (event for event in events if isinstance(event, VisitEnded))
     assert (begun.steps, begun.views, ended.block) == (50, 5, 0)
-    assert [event.sweep for event in events if isinstance(event, SweepEnded)] == [0]
+    assert [event.sweep for event in events if isinstance(event, EpochEnded)] == [0]
     assert [(written, state["step"]) for written, state in disk.commits] == [({0}, 50)]
 
 

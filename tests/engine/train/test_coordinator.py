@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.space.ordering import front_to_back
-from abcd_ns.engine.store.settle import with_mail
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE, WHOLE
+from abcd_ns.engine.store.commit import with_pending
+from abcd_ns.engine.store.special_blocks import LIVE, PENDING, WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -114,7 +114,7 @@ def test_nothing_is_lost_when_gaussians_migrate(make, photos, start, blocks):
         assert coordinator.count() == len(start)
         if coordinator.state.active is None:
             for b in range(blocks):
-                means = with_mail(coordinator.scene, b).gaussians.means
+                means = with_pending(coordinator.scene, b).gaussians.means
                 assert bool((coordinator.scene.tree.assign(means) == b).all())
     assert (sum(event.migrated for event in ended) > 0) == (blocks > 1)
 
@@ -131,7 +131,7 @@ def test_migrants_take_their_moments_along(make, photos):
     arrived_before, at_rest = coordinator.scene.count(other), coordinator.scene.state(other)
     train_step(coordinator, photos)
     assert equal(coordinator.scene.state(other).gaussians, at_rest.gaussians)
-    arrived = with_mail(coordinator.scene, other)
+    arrived = with_pending(coordinator.scene, other)
     assert len(arrived) == coordinator.scene.count(other) == arrived_before + 1
     assert equal(coordinator.scene.gaussians(other), arrived.gaussians)
     assert torch.allclose(arrived.gaussians.scales[-1], row, atol=0.02)
@@ -178,8 +178,8 @@ def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(make,
     coordinator.state.active = None
     coordinator.state.queue.clear()
     come = coordinator.scene.state(unseen)[:3]
-    coordinator.run.rest(coordinator.scene.tree, {INBOX: come}, within=0.0)
-    assert coordinator.scene.mail(unseen) is not None
+    coordinator.run.rest(coordinator.scene.tree, {PENDING: come}, within=0.0)
+    assert coordinator.scene.pending_for(unseen) is not None
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)
     assert unseen in {event.block for event in begun}
@@ -194,7 +194,7 @@ def test_events_tell_the_whole_story(make, photos):
     begun = [e for e in events if isinstance(e, VisitBegan)]
     assert kinds.count(StepTaken) == 45 == sum(e.steps for e in begun)
     assert kinds.count(VisitBegan) == kinds.count(VisitEnded) == coordinator.state.visit
-    assert kinds.count(SweepEnded) == coordinator.state.sweep + 1
+    assert kinds.count(EpochEnded) == coordinator.state.sweep + 1
     assert {e.block for e in begun} == {0, 1, 2}
     for visit in begun:
         drawn = [e for e in events if isinstance(e, LayersDrawn) and e.visit == visit.visit]
@@ -272,7 +272,7 @@ def off_from_merged(coordinator, batch, pictures) -> list[torch.Tensor]:
     return found
 
 
-def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(make, start):
+def test_an_oversized_gaussian_is_trained_where_it_reaches_out_of_its_cell(make, start):
     """Drawn behind what it hides, it would learn nothing there, and spoil the picture unseen."""
     start.scales[3] = math.log(0.7)
     start.opacities[3] = 2.0

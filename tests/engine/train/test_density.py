@@ -13,7 +13,7 @@ from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
 from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture
-from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, wider_than
+from abcd_ns.engine.train.health.health_rules import OVERSIZED_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -72,9 +72,9 @@ def test_what_is_too_wide_is_measured_by_the_nearest_camera():
     views = ring_of_views(3)
     gaussians = random_gaussians(20)
     nearest = torch.stack([(gaussians.means - view.center).norm(dim=1) for view in views]).amin(dim=0)
-    gaussians.scales[:] = (GIANT_ANGLE * nearest * 0.99).log()[:, None]
+    gaussians.scales[:] = (OVERSIZED_ANGLE * nearest * 0.99).log()[:, None]
     gaussians.scales[4, 1] += 0.02
-    over, _ = wider_than(GIANT_ANGLE, gaussians.scales, gaussians.means, views)
+    over, _ = wider_than(OVERSIZED_ANGLE, gaussians.scales, gaussians.means, views)
     assert over.nonzero().tolist() == [[4, 1]]
 
 

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.train.density.growing import chosen, halve
+from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 
-def halved(gaussians: Gaussians, which, axis=None, growth=None):
+def after_split(gaussians: Gaussians, which, axis=None, growth=None):
     """The Gaussians afterwards, and their statistics."""
     params, optimizers = nothing_live(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     axis = gaussians.scales.argmax(dim=1) if axis is None else axis
-    found = halve(params, optimizers, growth or {}, torch.as_tensor(which), axis)
+    found = split_gaussians(params, optimizers, growth or {}, torch.as_tensor(which), axis)
     for name in PARAM_NAMES:
         (held,) = optimizers[name].param_groups[0]["params"]
         assert held is params[name]
@@ -45,7 +45,7 @@ def optical_depth(gaussians: Gaussians):
 @given(SEEDS, st.integers(1, 9))
 def test_two_have_the_optical_depth_the_middle_and_the_variance_of_the_one(seed, count):
     before = random_gaussians(count, seed=seed)
-    after, _ = halved(before, [True] * count)
+    after, _ = after_split(before, [True] * count)
     first, second = after[:count], after[count:]
     assert torch.allclose(optical_depth(first) + optical_depth(second), optical_depth(before), rtol=1e-4)
     assert torch.allclose((first.means + second.means) / 2, before.means, atol=1e-6)
@@ -59,7 +59,7 @@ def test_two_have_the_optical_depth_the_middle_and_the_variance_of_the_one(seed,
 @given(SEEDS)
 def test_they_lie_along_the_axis_that_is_asked_for(seed):
     before, axis = random_gaussians(6, seed=seed), torch.tensor([0, 1, 2, 0, 1, 2])
-    after, _ = halved(before, [True] * 6, axis)
+    after, _ = after_split(before, [True] * 6, axis)
     turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(before.quats, dim=1))
     apart = torch.nn.functional.normalize(after.means[:6] - before.means, dim=1)
     along = turned[torch.arange(6), :, axis]
@@ -71,7 +71,7 @@ def test_they_lie_along_the_axis_that_is_asked_for(seed):
 def test_the_others_and_their_statistics_stay_and_the_halves_inherit():
     before = random_gaussians(5, seed=2)
     growth = {"weight": torch.arange(5.0), "passes": torch.arange(5.0)}
-    after, found = halved(before, [False, True, False, True, False], growth=growth)
+    after, found = after_split(before, [False, True, False, True, False], growth=growth)
     for name in PARAM_NAMES:
         assert torch.equal(getattr(after, name)[:3], getattr(before, name)[[0, 2, 4]])
     assert found["weight"].tolist() == [0, 2, 4, 0.5, 1.5, 0.5, 1.5]
@@ -79,9 +79,9 @@ def test_the_others_and_their_statistics_stay_and_the_halves_inherit():
     assert growth["weight"].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_nobody_is_halved_where_none_is_to_be():
+def test_nobody_is_split_where_none_is_to_be():
     before = random_gaussians(5)
-    after, found = halved(before, [False] * 5, growth={"weight": torch.ones(5)})
+    after, found = after_split(before, [False] * 5, growth={"weight": torch.ones(5)})
     assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in PARAM_NAMES)
     assert found["weight"].tolist() == [1.0] * 5
 
@@ -90,7 +90,7 @@ def test_a_picture_changes_less_than_by_copies_or_by_halves_drawn_at_random():
     """What 3DGS does to small ones, and to large ones."""
     draw, views = TorchRasterizer(), ring_of_views(3, width=80, height=60)
     before = random_gaussians(12, seed=3, size=0.12)
-    after, _ = halved(before, [True] * 12)
+    after, _ = after_split(before, [True] * 12)
     copies = Gaussians.cat([before, before])
     drawn = torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(0)) * before.scales.exp()
     turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(before.quats, dim=1))
@@ -120,7 +120,7 @@ def test_where_there_is_more_room_than_gaussians_only_those_grow_that_want_to():
 def test_the_opaque_stay_opaque():
     before = random_gaussians(3)
     before.opacities[:] = torch.tensor([[30.0], [6.0], [0.0]])
-    after, _ = halved(before, [True] * 3)
+    after, _ = after_split(before, [True] * 3)
     shown = torch.sigmoid(after.opacities[:3, 0])
     assert bool(after.opacities.isfinite().all())
     assert bool((shown[:2] > 0.99).all())

@@ -1,4 +1,4 @@
-"""What goes wrong while a block is trained is noticed, told and mended; what is healthy is left as it is."""
+"""What goes wrong while a block is trained is noticed, logged and repaired; what is healthy is left alone."""
 
 import math
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import Mended, VisitBegan
+from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
@@ -40,8 +40,8 @@ def test_a_healthy_run_is_the_same_with_and_without(make, photos, monkeypatch):
     for watched in (True, False):
         if not watched:
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
-        coordinator = make(str(watched), heal=watched, blocks=2, steps=18, density=GROWING, scaffold=120)
-        told = listen(coordinator, Mended)
+        coordinator = make(str(watched), heal=watched, blocks=2, steps=18, density=GROWING, coarse_model=120)
+        told = listen(coordinator, Repaired)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
         assert told == []
@@ -51,7 +51,7 @@ def test_a_healthy_run_is_the_same_with_and_without(make, photos, monkeypatch):
 @pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
 def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(make, photos, value, blocks):
     coordinator = make(blocks=blocks, steps=12, density=GROWING)
-    told = listen(coordinator, Mended)
+    told = listen(coordinator, Repaired)
     spoil_gradients(coordinator, "scales", 2, value)
     train(coordinator, photos)
     assert {event.what for event in told} == {"gradients"}
@@ -66,7 +66,7 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     coordinator = make(blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
-    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Mended)
+    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Repaired)
     with torch.no_grad():
         coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
@@ -74,8 +74,8 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     kept = squares[1].clone()
     squares[0] = math.inf
     coordinator.save()
-    mended = sorted((event.what, event.count, event.block) for event in told)
-    assert mended == [("moments", 1, block), ("values", 1, block)]
+    repaired = sorted((event.what, event.count, event.block) for event in told)
+    assert repaired == [("moments", 1, block), ("values", 1, block)]
     assert bool((squares[0] == 0).all())
     assert torch.equal(squares[1], kept)
     live = coordinator.scene.gaussians(block)
@@ -98,34 +98,36 @@ def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos)
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(make, views, photos, blocks):
+def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make, views, photos, blocks):
     coordinator = make(blocks=blocks, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
     with torch.no_grad():
         scales[0] = torch.tensor([5.0, -3.0, 5.0])
         means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
-    told, kept = listen(coordinator, Mended), scales[2:].clone()
-    coordinator.health.hold_back_giants(views)
+    told, kept = listen(coordinator, Repaired), scales[2:].clone()
+    coordinator.health.shrink_oversized(views)
     assert [(event.what, event.count) for event in told] == [("giants", 1)]
     nearest = min(float((means[0] - view.center).norm()) for view in views)
-    limit = health_rules.GIANT_ANGLE * nearest
+    limit = health_rules.OVERSIZED_ANGLE * nearest
     assert scales[0].tolist() == pytest.approx([math.log(limit), -3.0, math.log(limit)])
     assert float(scales[1].max()) == pytest.approx(math.log(100.0))
     assert torch.equal(scales[2:], kept)
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_giants_shrink_before_their_block_is_trained_and_never_after(make, views, photos, start, blocks):
+def test_oversized_gaussians_shrink_before_their_block_is_trained_and_never_after(
+    make, views, photos, start, blocks
+):
     """A wall of one colour may be one oversized Gaussian: pictures without it were never seen."""
     start.scales[0] = 5.0
     coordinator = make(blocks=blocks, steps=20, warmup=0.0, density=STILL)
-    told = listen(coordinator, Mended)
+    told = listen(coordinator, Repaired)
     train(coordinator, photos, steps=19)
     assert {event.what for event in told} == {"giants"}
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
-    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.GIANT_ANGLE
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.OVERSIZED_ANGLE
     with torch.no_grad():
         coordinator.params["scales"][1] = 5.0
     train(coordinator, photos)
@@ -147,14 +149,14 @@ def test_every_parameter_is_looked_at(name):
 
 
 def test_how_blocks_stand_is_said_in_words():
-    ledger = {
+    health_by_block = {
         0: BlockHealth(visits=3),
         1: BlockHealth(visits=2),
         2: BlockHealth(visits=1, hidden=True),
         4: BlockHealth(visits=2, gradients=1200),
     }
     views = {0: 9, 1: 1, 2: 8, 3: 0, 4: 7, 5: 6}
-    words = [standing(block, ledger.get(block), views) for block in range(6)]
+    words = [standing(block, health_by_block.get(block), views) for block in range(6)]
     assert words == [
         "trained",
         "seen by 1 view only",
@@ -163,7 +165,7 @@ def test_how_blocks_stand_is_said_in_words():
         "trained",
         "not visited yet",
     ]
-    lines = summary(6, ledger, views)
+    lines = summary(6, health_by_block, views)
     assert "block 4: seen by no view, left as it was" in lines
     assert lines[-1].startswith("1,200 gradients that were no numbers set to zero")
     assert summary(2, {0: BlockHealth(visits=1), 1: BlockHealth(visits=1)}, {0: 5, 1: 5}) == [

@@ -18,7 +18,9 @@ def begin(make):
     """Makes runs with a warm-up of 12 steps."""
 
     def begun(**options):
-        return make(**{"blocks": 4, "steps": 60, "warmup": 0.2, "density": STILL, "scaffold": 40, **options})
+        return make(
+            **{"blocks": 4, "steps": 60, "warmup": 0.2, "density": STILL, "coarse_model": 40, **options}
+        )
 
     return begun
 
@@ -95,7 +97,7 @@ def test_the_warm_up_draws_no_view_again_that_it_has_used(begin, views, photos, 
         return influence(gaussians, owner, others, *rest, **options)
 
     monkeypatch.setattr("abcd_ns.engine.train.coordinator.influence", watched)
-    coordinator = begin(density=PRICED, scaffold=len(start))
+    coordinator = begin(density=PRICED, coarse_model=len(start))
     train(coordinator, photos, steps=4)
     coordinator.save()
     coordinator.restore()
@@ -176,4 +178,4 @@ def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
     run.state.in_flight.append(first)
     assert run.visits.begin(at_once=2).geometry.block == queued[-1]
     run.state.in_flight.clear()
-    assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the sweep's order
+    assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the epoch's order

@@ -48,7 +48,7 @@ def learnt(tmp_path_factory, views, photos):
 
     def run(density=GROWING, sh_degree=1, **options) -> str:
         start = random_gaussians(120, seed=1, size=0.12, sh_degree=sh_degree)
-        usual = {"blocks": 2, "steps": 24, "scaffold": 60, "warmup": 0.3, "coarse": 0.2}
+        usual = {"blocks": 2, "steps": 24, "coarse_model": 60, "warmup": 0.3, "coarse": 0.2}
         if "poses" in options:
             usual["target"] = lambda sample: (sample.reduced(photos(sample.view.index, sample.source)), None)
         options = {**usual, "density": DensityConfig(**density), **options}

@@ -118,7 +118,7 @@ def test_where_poses_are_not_refined_a_run_knows_nothing_of_them(make, photos):
 
 @pytest.mark.parametrize(("blocks", "warmup"), [(1, 0.0), (4, 0.3)])
 def test_a_run_that_stops_goes_on_with_its_poses(make, photos, blocks, warmup):
-    options = {"blocks": blocks, "steps": 30, "warmup": warmup, "scaffold": 60}
+    options = {"blocks": blocks, "steps": 30, "warmup": warmup, "coarse_model": 60}
     whole, again = assert_resumes(make, photos, 14, **options)
     assert torch.equal(poses_of(again.run), poses_of(whole.run))
     assert not torch.equal(poses_of(whole.run), torch.stack([view.viewmat for view in shaken(RING)]))
@@ -130,7 +130,7 @@ def test_where_photos_are_too_many_for_many_uses_poses_are_refined_all_the_same(
 ):
     """From a share of the run on that the warm-up comes to, for with workers they are refined there alone."""
     monkeypatch.setattr(pose_rounds, "FIRST", 1e9)
-    made = make(blocks=blocks, steps=60, warmup=warmup, scaffold=60)
+    made = make(blocks=blocks, steps=60, warmup=warmup, coarse_model=60)
     while made.progress < pose_rounds.LATEST:
         train(made, photos, steps=1)
         assert made.state.posed == 0

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.train.schedule import (
     SHORTER,
-    YOUNG,
+    UNDER_TRAINED,
     exponential_decay,
+    final_decay,
     passes_of_visit,
-    plan_sweep,
-    settling,
+    plan_epoch,
     sh_degree_at,
     view_order,
     views_per_step,
@@ -24,50 +24,58 @@ VIEWS = st.dictionaries(st.integers(0, 30), st.integers(0, 200), min_size=1, max
 
 
 @given(views=VIEWS, passes=st.integers(1, 6), sweep=st.integers(0, 50), seed=st.integers(0, 5))
-def test_a_sweep_visits_every_seen_block_once_in_proportion_to_its_views(views, passes, sweep, seed):
-    plans = plan_sweep(sweep, views, passes, None, seed)
+def test_an_epoch_visits_every_seen_block_once_in_proportion_to_its_views(views, passes, sweep, seed):
+    plans = plan_epoch(sweep, views, passes, None, seed)
     assert {p.block: p.steps for p in plans} == {b: passes * n for b, n in views.items() if n > 0}
     assert len(plans) == len({p.block for p in plans})
 
 
 @given(views=VIEWS, passes=st.integers(1, 6), budget=st.integers(1, 5000), seed=st.integers(0, 3))
-def test_sweeps_use_up_the_budget_exactly(views, passes, budget, seed):
+def test_epochs_use_up_the_budget_exactly(views, passes, budget, seed):
     if not any(views.values()):
-        assert plan_sweep(0, views, passes, budget, seed) == ()
+        assert plan_epoch(0, views, passes, budget, seed) == ()
         return
-    left, sweeps = budget, 0
+    left, epochs = budget, 0
     while left > 0:
-        plans = plan_sweep(sweeps, views, passes, left, seed)
+        plans = plan_epoch(epochs, views, passes, left, seed)
         assert plans
         left -= sum(plan.steps for plan in plans)
-        sweeps += 1
+        epochs += 1
     assert left == 0
 
 
 @given(views=VIEWS, passes=st.integers(1, 6), batches=st.dictionaries(st.integers(0, 30), st.integers(1, 4)))
 def test_a_visit_uses_its_views_as_often_whatever_a_step_draws(views, passes, batches):
-    for plan in plan_sweep(0, views, passes, None, 0, batches=batches):
+    for plan in plan_epoch(0, views, passes, None, 0, batches=batches):
         batch, uses = batches.get(plan.block, 1), passes * views[plan.block]
         assert uses <= plan.steps * batch < uses + batch
 
 
-def test_the_last_sweep_shares_views_also_where_steps_draw_different_numbers():
-    plans = plan_sweep(3, {0: 10, 1: 30}, passes=4, remaining=50, seed=0, batches={0: 1, 1: 2})
+def test_the_last_epoch_shares_views_also_where_steps_draw_different_numbers():
+    plans = plan_epoch(3, {0: 10, 1: 30}, passes=4, remaining=50, seed=0, batches={0: 1, 1: 2})
     assert {plan.block: plan.steps for plan in plans} == {0: 20, 1: 30}
 
 
 @pytest.mark.parametrize(
-    ("trained", "draws"), [(0, 1), (YOUNG - 1, 1), (YOUNG, 2), (2 * YOUNG, 4), (1000 * YOUNG, 4), (None, 4)]
+    ("trained", "draws"),
+    [
+        (0, 1),
+        (UNDER_TRAINED - 1, 1),
+        (UNDER_TRAINED, 2),
+        (2 * UNDER_TRAINED, 4),
+        (1000 * UNDER_TRAINED, 4),
+        (None, 4),
+    ],
 )
-def test_the_steps_of_a_young_block_draw_fewer_views(trained, draws):
+def test_the_steps_of_an_under_trained_block_draw_fewer_views(trained, draws):
     assert views_per_step(0, 8, trained=trained) == draws
     assert views_per_step(0, 8, limit=2, trained=trained) == min(draws, 2)
     assert views_per_step(3, 8, trained=trained) == 3  # as is asked for
     assert views_per_step(0, 1, trained=trained) == 1
 
 
-def test_the_last_sweep_is_shared_in_proportion():
-    plans = plan_sweep(3, {0: 10, 1: 30}, passes=4, remaining=80, seed=0)
+def test_the_last_epoch_is_shared_in_proportion():
+    plans = plan_epoch(3, {0: 10, 1: 30}, passes=4, remaining=80, seed=0)
     assert {plan.block: plan.steps for plan in plans} == {0: 20, 1: 60}
 
 
@@ -105,15 +113,15 @@ def test_learning_rate_decays_exponentially():
 
 
 def test_rates_of_one_block_fall_at_the_end_of_the_run():
-    assert [settling(progress, 5000) for progress in (0.0, 0.3, 0.6)] == [1.0, 1.0, 1.0]
-    assert settling(0.8, 5000) == pytest.approx(10**-0.5)
-    assert settling(1.0, 5000) == pytest.approx(0.1)
-    assert settling(3.0, 5000) == pytest.approx(0.1)  # a budget of seconds that was overdrawn
+    assert [final_decay(progress, 5000) for progress in (0.0, 0.3, 0.6)] == [1.0, 1.0, 1.0]
+    assert final_decay(0.8, 5000) == pytest.approx(10**-0.5)
+    assert final_decay(1.0, 5000) == pytest.approx(0.1)
+    assert final_decay(3.0, 5000) == pytest.approx(0.1)  # a budget of seconds that was overdrawn
 
 
 def test_rates_of_a_block_that_saw_few_views_hardly_fall():
-    assert settling(1.0, 0) == 1.0
-    assert settling(1.0, 100) == pytest.approx(10**-0.1)
+    assert final_decay(1.0, 0) == 1.0
+    assert final_decay(1.0, 100) == pytest.approx(10**-0.1)
 
 
 def test_degree_of_30000_steps_is_splatfactos():

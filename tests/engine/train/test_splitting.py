@@ -5,7 +5,7 @@ import pytest
 from abcd_ns.engine.events import BlockSplit, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.health_record import BlockHealth, standing
@@ -25,9 +25,9 @@ def test_parts_are_small_enough_and_hold_everything(limit):
     gaussians = random_gaussians(300)
     tree = build_kd(gaussians.means, 3)
     owner = tree.assign(gaussians.means)
-    settled = {b: BlockState.fresh(gaussians[owner == b]) for b in range(3)}
-    settled = {b: BlockState(s.gaussians, s.exp_avg, s.exp_avg_sq, {}, Clocks(b)) for b, s in settled.items()}
-    cut, parts, parents = split_full(tree, settled, Limits(limit))
+    updates = {b: BlockState.fresh(gaussians[owner == b]) for b in range(3)}
+    updates = {b: BlockState(s.gaussians, s.exp_avg, s.exp_avg_sq, {}, Clocks(b)) for b, s in updates.items()}
+    cut, parts, parents = split_full(tree, updates, Limits(limit))
     assert all(len(state) <= FULL * limit for state in parts.values())
     assert set().union(*map(rows, parts.values())) == rows(BlockState.fresh(gaussians))
     assert cut.num_blocks == len(parts) == 3 + len(parents)
@@ -48,11 +48,11 @@ def test_what_cannot_be_parted_is_left_as_it_is():
     assert (cut, list(parts), parents) == (tree, [0], {})
 
 
-def test_the_reserve_is_no_block():
+def test_the_deferred_is_no_block():
     gaussians = random_gaussians(50)
     tree = build_kd(gaussians.means, 1)
-    waiting = BlockState.fresh(gaussians)
-    assert split_full(tree, {RESERVE: waiting}, Limits(10)) == (tree, {RESERVE: waiting}, {})
+    deferred = BlockState.fresh(gaussians)
+    assert split_full(tree, {DEFERRED: deferred}, Limits(10)) == (tree, {DEFERRED: deferred}, {})
 
 
 def test_a_part_is_visited_next_to_the_block_it_came_from():
@@ -71,7 +71,7 @@ def test_a_part_has_had_the_visits_of_the_block_it_came_from():
     state.inherit(2, 0)
     state.inherit(3, 1)
     assert state.health.keys() == {0, 2}
-    assert state.health[2] == BlockHealth(visits=3)  # what was shed is told once
+    assert state.health[2] == BlockHealth(visits=3)  # what was pruned is told once
     assert standing(2, state.health[2], {}) == "trained"
 
 

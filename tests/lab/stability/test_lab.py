@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step
+from abcd_ns.engine.train.schedule import COARSE_MODEL_PASSES, views_per_step
 from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 
 
@@ -21,7 +21,7 @@ def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, waiting, blocks)
     config = TrainingConfig(warmup=0.2, batch=0)
     steps = steps_for(drawn, config, blocks, views, waiting)
     least = 0.0 if blocks == 1 else 0.2 * steps
-    enough = SCAFFOLD_PASSES * views
+    enough = COARSE_MODEL_PASSES * views
     warm = math.ceil(min(enough, least) if waiting else min(max(enough, least), 2 * least))
     trained, found = [warm] * blocks, warm
     for step in range(steps - warm):  # a block after the other

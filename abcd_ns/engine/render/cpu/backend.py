@@ -92,7 +92,7 @@ class TorchRasterizer(Rasterizer):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        weigh: bool = False,
+        blend_weights: bool = False,
         judge: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
@@ -100,14 +100,14 @@ class TorchRasterizer(Rasterizer):
         center = slice(self.primitive.center, self.primitive.center + 2)
         takes = planes.requires_grad
         means2d = planes.detach()[:, center].transpose(1, 2).contiguous().requires_grad_(takes)
-        weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_() if weigh else None
-        info = _info(means2d, planes, shots) | ({"weights": weights} if weigh else {})
+        weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_() if blend_weights else None
+        info = _info(means2d, planes, shots) | ({"weights": weights} if blend_weights else {})
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         crops, windows = [shot.crop for shot in shots], [shot.z_window for shot in shots]
         if self._suits(gaussians, planes, *(others for _, others in frozen)):
             parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
             parts += [native.Part(others, k, True) for k, others in frozen]
-            lists = native.Lists(parts, crops, self.primitive, windows, weighs=weigh)
+            lists = native.Lists(parts, crops, self.primitive, windows, wants_weights=blend_weights)
             drawing = native.Drawing(lists)
             info |= {"sums": drawing} if judge else {}
             drawn = iter(native.Composite.apply(planes, means2d, weights, drawing))
@@ -169,11 +169,11 @@ class TorchRasterizer(Rasterizer):
         planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
         front, inside, back = ([getattr(shot, n) for shot in shots] for n in ("front", "inside", "back"))
         lists = self._lists(gaussians, planes, [shot.crop for shot in shots])
-        members = self._members(lists, inside, len(gaussians), len(shots))
+        kept_ids = self._kept_ids(lists, inside, len(gaussians), len(shots))
         layers = zip(*(self._layers(lists, planes, each) for each in (front, back)), strict=True)
         return [
             Cut(*both, Splats(own.index_select(1, which)), which)
-            for both, own, which in zip(layers, planes, members, strict=True)
+            for both, own, which in zip(layers, planes, kept_ids, strict=True)
         ]
 
     @torch.no_grad()
@@ -257,12 +257,12 @@ class TorchRasterizer(Rasterizer):
         """What compositing reads of several views."""
         return _side_by_side(planes[:, : self.primitive.graded])
 
-    def _members(
+    def _kept_ids(
         self, lists: native.Lists | reference.Lists, windows: Sequence[ZWindow], count: int, views: int
     ) -> list[Int[Tensor, "m"]]:
         """By view the Gaussians with a pair in the window, ascending."""
         if isinstance(lists, native.Lists):
-            return [own.nonzero()[:, 0] for own in lists.members(windows).view(views, count)]
+            return [own.nonzero()[:, 0] for own in lists.kept_ids(windows).view(views, count)]
         found = lists.within(windows).column.unique()
         firsts = torch.arange(views + 1, device=found.device) * count
         ends = torch.searchsorted(found, firsts).tolist()

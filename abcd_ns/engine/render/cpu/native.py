@@ -109,7 +109,7 @@ class Lists:
 
     Args:
         windows: leave out of masked parts what lies outside.
-        weighs: depths are 0, see Rasterizer.draw.
+        wants_weights: depths are 0, see Rasterizer.draw.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Lists:
         crops: Sequence[Crop],
         primitive: Primitive,
         windows: Windows = (),
-        weighs: bool = False,
+        wants_weights: bool = False,
     ) -> None:
         self.primitive, self.crops = primitive, tuple(crops)
         self._parts = [part.planes.detach().contiguous() for part in parts]  # read when gradients are taken
@@ -129,7 +129,9 @@ class Lists:
         ]
         pictures, counts = self._pictures(windows), (ctypes.c_int64(len(each)) for each in (rows, crops))
         given = ((_Part * len(rows))(*rows), next(counts), pictures.rows, next(counts))
-        self.handle = _POINTER(library().abcd_lists(int(primitive.name == "2dgs"), *given, int(weighs)))
+        self.handle = _POINTER(
+            library().abcd_lists(int(primitive.name == "2dgs"), *given, int(wants_weights))
+        )
         weakref.finalize(self, library().abcd_free, self.handle)
 
     def _pictures(self, windows: Windows) -> "_Pictures":
@@ -150,7 +152,7 @@ class Lists:
         library().abcd_draw(self.handle, pictures.rows, _as_images(images), int(keep))
         return images
 
-    def members(self, windows: Windows) -> Bool[Tensor, "n"]:
+    def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:
         """Which columns, numbered part by part, have a fragment in the windows."""
         found: UInt8[Tensor, n] = torch.zeros(self.columns, dtype=torch.uint8)
         pictures = self._pictures(windows)
@@ -219,7 +221,7 @@ class Composite(torch.autograd.Function):
         images = drawing.lists.draw(keep=keep)
         outputs = tuple(tensor for image in images for tensor in image)
         ctx.save_for_backward(*outputs)
-        ctx.shape, ctx.drawing, ctx.weighs = planes.shape, drawing, weights is not None
+        ctx.shape, ctx.drawing, ctx.wants_weights = planes.shape, drawing, weights is not None
         ctx.set_materialize_grads(False)
         return outputs
 
@@ -228,7 +230,7 @@ class Composite(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         drawing, (views, _, n) = ctx.drawing, ctx.shape
         lists, center = drawing.lists, drawing.lists.primitive.center
-        rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.weighs else None
+        rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.wants_weights else None
         residuals = drawing.residuals
         drawing.values = torch.zeros((views, n, SUMS)) if residuals else None
         held = [None if grad is None else grad.contiguous() for grad in grads]

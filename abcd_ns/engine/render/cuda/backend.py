@@ -15,7 +15,7 @@ from torch import Tensor
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.kinds import KINDS
-from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, Packed
+from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
 from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
@@ -25,9 +25,9 @@ from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, r
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
 
-SURVEY_BYTES = 256 << 20
+FOOTPRINT_BYTES = 256 << 20
 """Of what is projected into several views at once, to see where they see it."""
-SURVEYED_BYTES = 100
+BYTES_PER_FOOTPRINT = 100
 """Of a Gaussian in a view meanwhile."""
 
 
@@ -57,7 +57,7 @@ class GsplatRasterizer(Rasterizer):
         """See Rasterizer.extents. Views are projected together, and all that is found is copied at once."""
         if len(gaussians) == 0:
             return super().extents(gaussians, views)
-        most = max(SURVEY_BYTES // (SURVEYED_BYTES * len(gaussians)), 1)
+        most = max(FOOTPRINT_BYTES // (BYTES_PER_FOOTPRINT * len(gaussians)), 1)
         found: list[Tensor] = [torch.empty(0)] * len(views)
         for places in _alike([(view.width, view.height, view.near) for view in views]):
             for k in range(0, len(places), most):
@@ -75,7 +75,7 @@ class GsplatRasterizer(Rasterizer):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        weigh: bool = False,
+        blend_weights: bool = False,
         judge: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
@@ -85,7 +85,7 @@ class GsplatRasterizer(Rasterizer):
         kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
         for places in _alike(kinds):
             alike = [shots[k] for k in places]
-            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, weigh, judge)
+            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, blend_weights, judge)
             rasters.update(zip(places, drawn, strict=True))
         for raster in rasters.values():
             raster.info["n_cameras"] = len(shots)
@@ -101,12 +101,12 @@ class GsplatRasterizer(Rasterizer):
             views, crops = [shot.view for shot in few], [shot.crop for shot in few]
             seen = self._seen(gaussians, views, sh_degree, antialiased)
             drawing = Drawing.of(
-                self._kind, Packed.of(seen, self._cameras), crops, self._cameras, windowed=True
+                self._kind, FlatSplats.of(seen, self._cameras), crops, self._cameras, windowed=True
             )
-            members = drawing.members(drawing.inside([shot.inside for shot in few]))
+            kept_ids = drawing.kept_ids(drawing.inside([shot.inside for shot in few]))
             fronts, backs = [shot.front for shot in few], [shot.back for shot in few]
             layers = (drawing.windowed(windows).layers() for windows in (fronts, backs))
-            for k, (front, back, which) in enumerate(zip(*layers, members, strict=True)):
+            for k, (front, back, which) in enumerate(zip(*layers, kept_ids, strict=True)):
                 yield Cut(front, back, seen.splats(k, which), which)
 
     @torch.no_grad()
@@ -122,7 +122,7 @@ class GsplatRasterizer(Rasterizer):
         for few in _a_few(seen, seen, gaussians):
             views, crops = zip(*few, strict=True)
             projected = self._seen(gaussians, views, 0, antialiased)
-            drawing = Drawing.of(self._kind, Packed.of(projected, self._cameras), crops, self._cameras)
+            drawing = Drawing.of(self._kind, FlatSplats.of(projected, self._cameras), crops, self._cameras)
             yield from drawing.windows(visible)
 
     def _seen(
@@ -138,7 +138,7 @@ class GsplatRasterizer(Rasterizer):
         shots: Sequence[Shot],
         sh_degree: int,
         antialiased: bool,
-        weigh: bool,
+        blend_weights: bool,
         judge: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
@@ -147,15 +147,15 @@ class GsplatRasterizer(Rasterizer):
         ]
         if len(gaussians) == 0 and not frozen:
             return _nothing(gaussians, shots)
-        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased, weigh)
-        everyone = Packed.of(own, self._cameras, frozen, weigh)
+        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased, blend_weights)
+        everyone = FlatSplats.of(own, self._cameras, frozen, blend_weights)
         windows = [shot.z_window for shot in shots]
         windowed = any(window is not None for window in windows)
         drawing = Drawing.of(self._kind, everyone, crops, self._cameras, windowed=windowed)
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
-        info = _info(own, views[0]) | ({"weights": own.weights} if weigh else {})
+        info = _info(own, views[0]) | ({"weights": own.weights} if blend_weights else {})
         if judge:
             info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
         sheet = drawing.rasterized()

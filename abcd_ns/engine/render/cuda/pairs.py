@@ -31,7 +31,7 @@ LAST_DEPTH = 0x7FFFFFFF
 
 
 @dataclass(frozen=True)
-class Packed:
+class FlatSplats:
     """m splats of several cameras in one list; pixels of the full images."""
 
     cameras: Int64[Tensor, "m"]
@@ -47,30 +47,37 @@ class Packed:
 
     @staticmethod
     def of(
-        own: Projected, cameras: Cameras, frozen: Sequence[tuple[int, Splats]] = (), weigh: bool = False
-    ) -> "Packed":
+        own: Projected,
+        cameras: Cameras,
+        frozen: Sequence[tuple[int, Splats]] = (),
+        blend_weights: bool = False,
+    ) -> "FlatSplats":
         """Camera by camera; then what is frozen, as (camera, what it sees) pairs.
 
         Args:
-            weigh: as `own` was projected, with zeros for the depths that are composited.
+            blend_weights: as `own` was projected, with zeros for the depths that are composited.
         """
         count, n = own.radii.shape
         numbers = cameras.numbers(count, n, own.radii.device)
         names = ("radii", "means2d", "depths", "shapes", "opacities", "features")
         values = [getattr(own, name).flatten(0, 1) for name in names]
         if not frozen:
-            return Packed(numbers, *values)
+            return FlatSplats(numbers, *values)
         firsts = numbers.view(count, n)[:, :1] if n else torch.arange(count, device=numbers.device)[:, None]
         each = Splats(torch.cat([splats.planes for _, splats in frozen], dim=1))
-        last = F.pad(each.colors, (0, 1)) if weigh else torch.cat((each.colors, each.depths[:, None]), dim=-1)
+        last = (
+            F.pad(each.colors, (0, 1))
+            if blend_weights
+            else torch.cat((each.colors, each.depths[:, None]), dim=-1)
+        )
         theirs = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, last)
-        owners = [firsts[camera].expand(len(splats)) for camera, splats in frozen]
+        frozen_cameras = [firsts[camera].expand(len(splats)) for camera, splats in frozen]
         pairs = zip(values, theirs, strict=True)
-        return Packed(torch.cat((numbers, *owners)), *(torch.cat(pair) for pair in pairs))
+        return FlatSplats(torch.cat((numbers, *frozen_cameras)), *(torch.cat(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
-class Sheet:
+class TileLayout:
     """A grid of tiles for each of several crops, all as large as the largest; a crop is in the upper left.
 
     Crops are grown up and left to gsplat's tiles, so that their tiles are those of the full image. Tiles that
@@ -119,9 +126,9 @@ class Sheet:
         cameras, rows, cols = self.shape
         return ((cameras - 1) << self.bits | rows * cols - 1) << 32 | LAST_DEPTH
 
-    def tile(self, keys: Int64[Tensor, "q"]) -> Int64[Tensor, "q"]:
+    def tile(self, isect_ids: Int64[Tensor, "q"]) -> Int64[Tensor, "q"]:
         """Number of each key's tile among those of all cameras."""
-        tile = keys >> 32
+        tile = isect_ids >> 32
         if len(self.crops) == 1:
             return tile
         return (tile >> self.bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self.bits) - 1)
@@ -162,35 +169,35 @@ class Drawing:
     """Second half of gsplat's `rasterization(packed=True)`, for crops."""
 
     kind: Kind
-    splats: Packed
+    splats: FlatSplats
     means2d: Float[Tensor, "m 2"]
     """Relative to the upper left tile of each splat's crop."""
     shapes: Float[Tensor, "m s"]
     """Likewise."""
-    sheet: Sheet
-    keys: Int64[Tensor, "q"]
+    layout: TileLayout
+    isect_ids: Int64[Tensor, "q"]
     """Sorted: camera, tile, bits of the depth."""
-    owners: Int[Tensor, "q"]
+    flatten_ids: Int[Tensor, "q"]
     """Whose they are."""
 
     @staticmethod
     def of(
-        kind: Kind, splats: Packed, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False
+        kind: Kind, splats: FlatSplats, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False
     ) -> "Drawing":
         """What may be drawn in a crop of each camera.
 
         Args:
             windowed: leave room for what windows are going to leave out.
         """
-        sheet = Sheet(tuple(crops), windowed)
+        layout = TileLayout(tuple(crops), windowed)
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
-        corners = cameras.corners(sheet.tiled, splats.means2d)
+        corners = cameras.corners(layout.tiled, splats.means2d)
         corners = corners if len(crops) == 1 else corners.index_select(0, splats.cameras)
         means2d, shapes = splats.means2d - corners, kind.moved(splats.shapes, corners)
         if len(splats) == 0:
-            return Drawing(kind, splats, means2d, shapes, sheet, splats.cameras, splats.cameras.int())
-        _, rows, cols = sheet.shape
-        _, keys, owners = isect_tiles(
+            return Drawing(kind, splats, means2d, shapes, layout, splats.cameras, splats.cameras.int())
+        _, rows, cols = layout.shape
+        _, isect_ids, flatten_ids = isect_tiles(
             means2d,
             splats.radii,
             splats.depths,
@@ -202,17 +209,17 @@ class Drawing:
             camera_ids=splats.cameras,
             gaussian_ids=splats.cameras,  # asked for, and not read
         )
-        return Drawing(kind, splats, means2d, shapes, sheet, keys, owners)
+        return Drawing(kind, splats, means2d, shapes, layout, isect_ids, flatten_ids)
 
     @property
     def tile(self) -> Int64[Tensor, "q"]:
         """Number of each pair's tile among those of all cameras."""
-        return self.sheet.tile(self.keys)
+        return self.layout.tile(self.isect_ids)
 
     @property
     def z(self) -> Float[Tensor, "q"]:
         """Camera z of each pair's Gaussian."""
-        return self.splats.depths.index_select(0, self.owners)
+        return self.splats.depths.index_select(0, self.flatten_ids)
 
     def inside(self, windows: Sequence[ZWindow | None], always: int = 0) -> Bool[Tensor, "q"]:
         """Which pairs lie within their tile's window.
@@ -221,20 +228,20 @@ class Drawing:
             windows: of each camera.
             always: the first so many splats do.
         """
-        near, far = self.sheet.spread(windows, self.splats.depths)
+        near, far = self.layout.spread(windows, self.splats.depths)
         tile, z = self.tile, self.z
         inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
-        return inside | (self.owners < always) if always else inside
+        return inside | (self.flatten_ids < always) if always else inside
 
     def windowed(self, windows: Sequence[ZWindow | None], always: int = 0) -> "Drawing":
         """Only what `inside` finds."""
-        near, far = self.sheet.spread(windows, self.splats.depths)
-        _, rows, cols = self.sheet.shape
-        sheet = self.sheet.bits, rows * cols, self.sheet.last_key
-        found = fused.windowed(near, far, self.keys, self.owners, always, *sheet)
+        near, far = self.layout.spread(windows, self.splats.depths)
+        _, rows, cols = self.layout.shape
+        layout = self.layout.bits, rows * cols, self.layout.last_key
+        found = fused.windowed(near, far, self.isect_ids, self.flatten_ids, always, *layout)
         if found is None:
             return self.only(self.inside(windows, always))
-        return replace(self, keys=found[0], owners=found[1])
+        return replace(self, isect_ids=found[0], flatten_ids=found[1])
 
     def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
         """Without some pairs. The others move up, in order, and the end of the lists belongs to the last
@@ -242,15 +249,17 @@ class Drawing:
         """
         count = len(keep)
         place = torch.where(keep, keep.cumsum(0) - 1, count)  # the others: to one place, which is cut off
-        keys = self.keys.new_full((count + 1,), self.sheet.last_key).scatter_(0, place, self.keys)
-        owners = self.owners.new_zeros(count + 1).scatter_(0, place, self.owners)
-        return replace(self, keys=keys[:count], owners=owners[:count])
+        isect_ids = self.isect_ids.new_full((count + 1,), self.layout.last_key).scatter_(
+            0, place, self.isect_ids
+        )
+        flatten_ids = self.flatten_ids.new_zeros(count + 1).scatter_(0, place, self.flatten_ids)
+        return replace(self, isect_ids=isect_ids[:count], flatten_ids=flatten_ids[:count])
 
-    def members(self, keep: Bool[Tensor, "q"]) -> list[Int64[Tensor, "_k"]]:
+    def kept_ids(self, keep: Bool[Tensor, "q"]) -> list[Int64[Tensor, "_k"]]:
         """Of each camera the splats that have any of these pairs; one wait. All have as many splats."""
         held = keep.new_zeros(len(self.splats) + 1)
-        held.index_fill_(0, torch.where(keep, self.owners, len(self.splats)).long(), True)
-        of_cameras = held[:-1].view(len(self.sheet.crops), -1)
+        held.index_fill_(0, torch.where(keep, self.flatten_ids, len(self.splats)).long(), True)
+        of_cameras = held[:-1].view(len(self.layout.crops), -1)
         # In order, those that are held first: so the host learns how many there are in a single copy.
         ids = of_cameras.byte().sort(dim=1, descending=True, stable=True).indices
         counts = of_cameras.sum(1).tolist()
@@ -259,7 +268,7 @@ class Drawing:
     def rasterized(self) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"]]:
         """Features and alphas of the whole sheet."""
         splats = self.splats
-        return self._rasterize(self.means2d, self.shapes, splats.features, splats.opacities, self.owners)
+        return self._rasterize(self.means2d, self.shapes, splats.features, splats.opacities, self.flatten_ids)
 
     def layers(self) -> list[Layer]:
         """What each crop looks like."""
@@ -272,10 +281,12 @@ class Drawing:
 
     def windows(self, visible: float) -> list[ZWindow]:
         """Where the splats show in each crop; see z_window.showing."""
-        _, rows, cols = self.sheet.shape
-        near, far = showing(self.sheet.pixels(self.keys.device), self.tile, self.z, self.weights(), visible)
+        _, rows, cols = self.layout.shape
+        near, far = showing(
+            self.layout.pixels(self.isect_ids.device), self.tile, self.z, self.weights(), visible
+        )
         found = []
-        for k, grid in enumerate(self.sheet.grids):
+        for k, grid in enumerate(self.layout.grids):
             sides = (side[k].view(rows, cols)[: grid.rows, : grid.cols].flatten() for side in (near, far))
             found.append(ZWindow(grid, *sides))
         return found
@@ -286,13 +297,13 @@ class Drawing:
         Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
         colour, of which one channel will do, is its weight.
         """
-        count = len(self.owners)
+        count = len(self.flatten_ids)
         if count == 0:
             return self.z
         parts = (self.means2d, self.shapes, self.splats.opacities)
-        means2d, shapes, opacities = (part.index_select(0, self.owners) for part in parts)
+        means2d, shapes, opacities = (part.index_select(0, self.flatten_ids) for part in parts)
         dark = means2d.new_zeros((count, 1)).requires_grad_()
-        each = torch.arange(count, device=dark.device, dtype=self.owners.dtype)
+        each = torch.arange(count, device=dark.device, dtype=self.flatten_ids.dtype)
         with torch.enable_grad():
             picture, _ = self._rasterize(means2d, shapes, dark, opacities, each)
             shown = [one[part].sum() for one, part in zip(picture, self.parts, strict=True)]
@@ -309,11 +320,11 @@ class Drawing:
         """
         parts = (self.means2d, self.shapes, self.splats.opacities)
         means2d, shapes, opacities = (part.detach() for part in parts)
-        asked, found = [moments(*pair) for pair in zip(residuals, self.sheet.crops, strict=True)], []
+        asked, found = [moments(*pair) for pair in zip(residuals, self.layout.crops, strict=True)], []
         for channels in (slice(0, 4), slice(4, 7), slice(7, SUMS)):  # a few at a time, for the memory
             dark = means2d.new_zeros((len(means2d), channels.stop - channels.start)).requires_grad_()
             with torch.enable_grad():
-                pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.owners)
+                pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.flatten_ids)
             upstream = torch.zeros_like(pictures)
             for one, part, wanted in zip(upstream, self.parts, asked, strict=True):
                 one[part] = wanted[..., channels]
@@ -326,20 +337,20 @@ class Drawing:
         shapes: Float[Tensor, "p s"],
         features: Float[Tensor, "p f"],
         opacities: Float[Tensor, "p"],
-        owners: Int[Tensor, "q"],
+        flatten_ids: Int[Tensor, "q"],
     ) -> tuple[Tensor, Tensor]:
-        cameras, rows, cols = self.sheet.shape
+        cameras, rows, cols = self.layout.shape
         return self.kind.draw(
             means2d,
             shapes,
             features,
             opacities,
-            *self.sheet.size,
+            *self.layout.size,
             TILE,
-            isect_offset_encode(self.keys, cameras, cols, rows),
-            owners,
+            isect_offset_encode(self.isect_ids, cameras, cols, rows),
+            flatten_ids,
             # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
-            masks=self.sheet.drawn(means2d.device),
+            masks=self.layout.drawn(means2d.device),
             packed=True,
         )
 
@@ -347,5 +358,6 @@ class Drawing:
     def parts(self) -> list[tuple[slice, slice]]:
         """Rows and columns of each crop in what is drawn of it."""
         return [
-            crop.within(tiled).slices for crop, tiled in zip(self.sheet.crops, self.sheet.tiled, strict=True)
+            crop.within(tiled).slices
+            for crop, tiled in zip(self.layout.crops, self.layout.tiled, strict=True)
         ]

@@ -144,13 +144,13 @@ def project(
     cameras: Cameras,
     sh_degree: int,
     antialiased: bool,
-    weigh: bool = False,
+    blend_weights: bool = False,
 ) -> Projected:
     """The first half of gsplat's `rasterization(packed=False)`, for the full images.
 
     Args:
         views: of one size and near plane.
-        weigh: give zeros for the depths that are composited.
+        blend_weights: give zeros for the depths that are composited.
     """
     placed, eyes = place_on_screen(kind, gaussians, views, cameras, antialiased)
     radii, means2d, depths, shapes, centers, compensations = placed
@@ -158,9 +158,9 @@ def project(
     opacities = opacities[None] if len(views) == 1 else opacities.expand(len(views), -1)
     if compensations is not None:
         opacities = opacities * compensations
-    weights = depths.detach().requires_grad_() if weigh else depths
+    weights = depths.detach().requires_grad_() if blend_weights else depths
     coefficients = gaussians.features_dc, gaussians.features_rest
-    features = _Features.apply(gaussians.means, eyes, *coefficients, weights, radii, sh_degree, weigh)
+    features = _Features.apply(gaussians.means, eyes, *coefficients, weights, radii, sh_degree, blend_weights)
     return Projected(radii, means2d, depths, shapes, opacities, features, centers, weights)
 
 
@@ -179,7 +179,7 @@ class _Features(torch.autograd.Function):
         last: Float[Tensor, "c n"],
         radii: Int[Tensor, "c n"],
         sh_degree: int,
-        weigh: bool,
+        blend_weights: bool,
     ) -> Float[Tensor, "c n 4"]:
         # All, whatever the degree: gsplat's kernels read those of it alone.
         coefficients = torch.cat((features_dc[:, None], features_rest), dim=1)
@@ -192,7 +192,9 @@ class _Features(torch.autograd.Function):
             seen = zip(directions, (radii > 0).unbind(), strict=True)
             colors = [spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen]
         ctx.graph = leaves, colors
-        features, dark = _shaded(_stacked([color.detach() for color in colors]), None if weigh else last)
+        features, dark = _shaded(
+            _stacked([color.detach() for color in colors]), None if blend_weights else last
+        )
         ctx.save_for_backward(dark)
         return features
 

@@ -11,29 +11,38 @@ BLOCK = 256
 
 @triton.jit(do_not_specialize=("count", "always", "bits", "tiles"))
 def _inside(
-    keys_ptr, owners_ptr, near_ptr, far_ptr, keep_ptr, count, always, bits, tiles, BLOCK: tl.constexpr
+    isect_ids_ptr,
+    flatten_ids_ptr,
+    near_ptr,
+    far_ptr,
+    keep_ptr,
+    count,
+    always,
+    bits,
+    tiles,
+    BLOCK: tl.constexpr,
 ):
     """[q]: 1 where a pair is within its tile's window, or its owner is one of the first, else 0."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = at < count
-    key = tl.load(keys_ptr + at, mask=mask, other=0)
+    key = tl.load(isect_ids_ptr + at, mask=mask, other=0)
     place = key >> 32
     tile = (place >> bits) * tiles + (place & ((1 << bits) - 1))
     z = (key & 0xFFFFFFFF).to(tl.int32).to(tl.float32, bitcast=True)
     inside = z >= tl.load(near_ptr + tile, mask=mask, other=0.0)
     inside = inside & (z < tl.load(far_ptr + tile, mask=mask, other=0.0))
-    inside = inside | (tl.load(owners_ptr + at, mask=mask, other=0) < always)
+    inside = inside | (tl.load(flatten_ids_ptr + at, mask=mask, other=0) < always)
     tl.store(keep_ptr + at, inside.to(tl.int32), mask=mask)
 
 
 @triton.jit(do_not_specialize=("count", "last_key"))
 def _move_up(
-    keys_ptr,
-    owners_ptr,
+    isect_ids_ptr,
+    flatten_ids_ptr,
     keep_ptr,
     kept_ptr,
-    new_keys_ptr,
-    new_owners_ptr,
+    new_isect_ids_ptr,
+    new_flatten_ids_ptr,
     count,
     last_key,
     BLOCK: tl.constexpr,
@@ -44,17 +53,17 @@ def _move_up(
     keep = tl.load(keep_ptr + at, mask=mask, other=0) != 0
     before = tl.load(kept_ptr + at, mask=mask, other=0)
     place = tl.where(keep, before - 1, tl.load(kept_ptr + count - 1) + at - before)
-    key = tl.load(keys_ptr + at, mask=mask, other=0)
-    owner = tl.load(owners_ptr + at, mask=mask, other=0)
-    tl.store(new_keys_ptr + place, tl.where(keep, key, last_key), mask=mask)
-    tl.store(new_owners_ptr + place, tl.where(keep, owner, 0), mask=mask)
+    key = tl.load(isect_ids_ptr + at, mask=mask, other=0)
+    owner = tl.load(flatten_ids_ptr + at, mask=mask, other=0)
+    tl.store(new_isect_ids_ptr + place, tl.where(keep, key, last_key), mask=mask)
+    tl.store(new_flatten_ids_ptr + place, tl.where(keep, owner, 0), mask=mask)
 
 
 def windowed(
     near: Float[Tensor, "t"],
     far: Float[Tensor, "t"],
-    keys: Int64[Tensor, "q"],
-    owners: Int[Tensor, "q"],
+    isect_ids: Int64[Tensor, "q"],
+    flatten_ids: Int[Tensor, "q"],
     always: int,
     bits: int,
     tiles: int,
@@ -64,16 +73,22 @@ def windowed(
 
     Args:
         near, far: camera z, by tile of all cameras.
-        keys: camera, tile (of so many `bits`), bits of a positive depth.
+        isect_ids: camera, tile (of so many `bits`), bits of a positive depth.
         always: owners below that are within.
         tiles: of each camera.
     """
-    count = len(keys)
+    count = len(isect_ids)
     if count == 0:
-        return keys, owners
-    keep, new_keys, new_owners = torch.empty_like(owners), torch.empty_like(keys), torch.empty_like(owners)
+        return isect_ids, flatten_ids
+    keep, new_isect_ids, new_flatten_ids = (
+        torch.empty_like(flatten_ids),
+        torch.empty_like(isect_ids),
+        torch.empty_like(flatten_ids),
+    )
     grid = (triton.cdiv(count, BLOCK),)
-    _inside[grid](keys, owners, near, far, keep, count, always, bits, tiles, BLOCK=BLOCK)
+    _inside[grid](isect_ids, flatten_ids, near, far, keep, count, always, bits, tiles, BLOCK=BLOCK)
     kept = keep.cumsum(0)
-    _move_up[grid](keys, owners, keep, kept, new_keys, new_owners, count, last_key, BLOCK=BLOCK)
-    return new_keys, new_owners
+    _move_up[grid](
+        isect_ids, flatten_ids, keep, kept, new_isect_ids, new_flatten_ids, count, last_key, BLOCK=BLOCK
+    )
+    return new_isect_ids, new_flatten_ids

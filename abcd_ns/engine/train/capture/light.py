@@ -20,7 +20,7 @@ Gradients = Sequence[tuple[int, Tensor]]
 """(view, the gradient by its transform) pairs, one for each picture."""
 Use = tuple[int, Tensor]
 """(view, its transform), of a picture that was drawn in its photo's light."""
-RATE, SETTLES = 0.05, 10.0
+RATE, DECAY_USES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
 LAST_RATE = 0.03
 """Share of it that is left at the end of the run."""
@@ -85,7 +85,7 @@ class Light:
         second = self._second[places] = self._second[places].lerp(summed.square(), 1 - BETAS[1])
         first, second = (m / (1 - beta**uses) for m, beta in zip((first, second), BETAS, strict=True))
         before = self._changes[places]
-        after = before - damping * RATE / (1 + uses / SETTLES) * first / (second.sqrt() + 1e-15)
+        after = before - damping * RATE / (1 + uses / DECAY_USES) * first / (second.sqrt() + 1e-15)
         self._changes[places] = after
         self._sum += (after.to(self._sum) - before.to(self._sum)).sum(dim=0)
 

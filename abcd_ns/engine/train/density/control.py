@@ -1,6 +1,6 @@
 """Growing and pruning the active block, on the block's own clock.
 
-The default strategy splits what is worth it (see `worth`) and takes out what fills little (see `shedding`);
+The default strategy splits what is worth it (see `worth`) and takes out what fills little (see `pruning`);
 MCMC is gsplat's own. gsplat's strategies keep a schedule in absolute steps of one global run.
 Here the schedule is in shares of the run and in the block's own steps, so it is kept in this file.
 """
@@ -20,17 +20,17 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussia
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.growing import chosen, halve
-from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
-from abcd_ns.engine.train.density.shedding import (
+from abcd_ns.engine.train.density.growing import chosen, split_gaussians
+from abcd_ns.engine.train.density.pruning import (
     FAINT,
     LAST,
-    are_weighed,
-    fills,
-    haze,
+    blend_sums,
+    contributions,
+    floaters,
+    have_contributions,
     risen,
-    weigh,
 )
+from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
 from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, worth
 
 GATHER, REFINE = 1, 6
@@ -94,7 +94,7 @@ class DensityControl:
         self.config, self._axes, self._binomials = config, primitive.axes, binomials()
 
     @property
-    def weighs(self) -> bool:
+    def wants_weights(self) -> bool:
         """Whether the rasterizer must leave `weights`."""
         return self.config.strategy == "default" and self.config.price > 0
 
@@ -165,7 +165,7 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            growth = added(growth, weigh(infos, clock.views))
+            growth = added(growth, blend_sums(infos, clock.views))
             for picture in judged:
                 add_picture(growth, live_gaussians(params).detach(), self._axes, picture)
             if not self.asks(clock.progress, clock.first):
@@ -181,24 +181,24 @@ class DensityControl:
                 return {}
             return self._step_default(params, optimizers, growth, clock)
 
-    def shed(
+    def prune(
         self,
         params: Params,
         optimizers: Optimizers,
         growth: dict[str, Tensor],
         progress: float,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's views, at a share of the run; haze; and what is too
-        faint for any picture to show, which nothing would train again.
+        """Take out what fills too little of the block's views, at a share of the run; floaters; and what is
+        too faint for any picture to show, which nothing would train again.
 
         Returns:
             The block's statistics from now on.
         """
-        if not self.weighs or not are_weighed(growth):
+        if not self.wants_weights or not have_contributions(growth):
             return growth
         price, faint = (risen(each, progress, self.config.refine_stop) for each in (self.config.price, FAINT))
         opacities = torch.sigmoid(params["opacities"][:, 0])
-        drop = (fills(growth) <= price) | (opacities < MIN_ALPHA) | haze(growth, opacities, faint)
+        drop = (contributions(growth) <= price) | (opacities < MIN_ALPHA) | floaters(growth, opacities, faint)
         growth = dict(growth)  # rows are taken out of it
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)
@@ -211,7 +211,7 @@ class DensityControl:
         wanted, axis = worth(growth, clock.views, config.split_pixels)
         most = math.ceil(MOST_NEW * len(wanted))
         room = most if clock.room is None else min(most, clock.room)
-        growth = halve(params, optimizers, growth, chosen(wanted, room), axis)
+        growth = split_gaussians(params, optimizers, growth, chosen(wanted, room), axis)
         growth[WORTH] = torch.zeros_like(growth[WORTH])
         faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
         if bool(faint.any()):

@@ -2,7 +2,7 @@
 
 45 of its 59 numbers say how its colour changes with the direction that it is seen from. Cameras see it from
 few directions, often from a narrow cone of them, in which fewer harmonics tell nearly as much. What their
-lack changes in the pictures is the Gaussian's weight, known from shedding, times the mean square, over its
+lack changes in the pictures is the Gaussian's weight, known from pruning, times the mean square, over its
 views, by which its colour changes once the lower harmonics are fitted to the higher ones. Of all degrees that
 one is taken for which this and the price of the numbers are least together; those above do not come back.
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, sh_degree_of, up_to_degree
-from abcd_ns.engine.train.density.shedding import are_weighed, fills
+from abcd_ns.engine.train.density.pruning import contributions, have_contributions
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
@@ -66,7 +66,7 @@ def lower(
     Returns:
         The block's statistics from now on.
     """
-    if not are_weighed(growth):
+    if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
     found = lowered(live_gaussians(params).detach(), growth, views)
@@ -82,10 +82,10 @@ def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[
     """Gaussians with the degrees that pay. Nobody is judged who was not drawn in all views yet.
 
     Args:
-        growth: with WEIGHED.
+        growth: with BLEND_SUMS.
         views: that the block is trained on.
     """
-    weight = fills(growth)
+    weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
     chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
     cameras = _beside(gaussians.means, chosen)
@@ -137,7 +137,7 @@ def _lowered(
 def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: int) -> Tensor:
     """The first `kept` coefficients such that they look like all of them, and zeros: [n, b, 3]."""
     ridge = RIDGE * torch.eye(kept, dtype=gram.dtype, device=gram.device)
-    # Unchecked: what is no number is mended when the visit ends, and pays nothing until then.
+    # Unchecked: what is no number is repaired when the visit ends, and pays nothing until then.
     low, _ = torch.linalg.cholesky_ex(gram[:, :kept, :kept] + ridge)
     more = torch.cholesky_solve(gram[:, :kept, kept:] @ values[:, kept:], low)
     return torch.cat((values[:, :kept] + more, torch.zeros_like(values[:, kept:])), dim=1)

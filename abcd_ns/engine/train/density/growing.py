@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 
 APART, NARROWED = 0.8, 0.6
 """Of the standard deviation of the one along its axis: how far from its middle the two lie, and their own.
 The squares add up to 1, so that the variance of both together is that of the one."""
 LEAST = 1e-6
 """Transmittance of the most opaque, whose optical depth would have no end."""
-WEIGHT = WEIGHED[0]
+WEIGHT = BLEND_SUMS[0]
 
 
 def chosen(wanted: Float[Tensor, "n"], room: int | None) -> Bool[Tensor, "n"]:
@@ -40,7 +40,7 @@ def chosen(wanted: Float[Tensor, "n"], room: int | None) -> Bool[Tensor, "n"]:
 
 
 @torch.no_grad()
-def halve(
+def split_gaussians(
     params: Params,
     optimizers: Optimizers,
     growth: Mapping[str, Tensor],

@@ -4,10 +4,10 @@ from abcd_ns.engine.events import Announcer, BlockSplit
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.space.partition import best_split
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.scaffold import split_by_block
+from abcd_ns.engine.store.coarse_model import split_by_block
+from abcd_ns.engine.store.commit import pending_without, with_pending, without
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.settle import inbox_without, with_mail, without
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
+from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 
@@ -16,25 +16,25 @@ FULL = 0.75
 
 
 def split_full(
-    tree: BlockTree, settled: dict[BlockName, BlockState], limits: Limits
+    tree: BlockTree, updates: dict[BlockName, BlockState], limits: Limits
 ) -> tuple[BlockTree, dict[BlockName, BlockState], dict[int, int]]:
     """Cut each block with more than FULL of its limit in equal halves, and those again if need be.
 
     Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
 
     Args:
-        settled: blocks that are about to be put to rest; what has a special name is left alone.
+        updates: blocks that are about to be put to rest; what has a special name is left alone.
 
     Returns:
         The tree with the cuts, everything to be put to rest, and of each new block the one that it was part
         of.
     """
     parents: dict[int, int] = {}
-    waiting = sorted(block for block in settled if isinstance(block, int))
-    settled = dict(settled)
+    waiting = sorted(block for block in updates if isinstance(block, int))
+    updates = dict(updates)
     while waiting:
         block = waiting.pop(0)
-        state = settled[block]
+        state = updates[block]
         if not is_full(len(state), tree.num_blocks, limits):
             continue
         means = state.gaussians.means
@@ -43,9 +43,9 @@ def split_full(
         if bool(leaves.all()) or not bool(leaves.any()):
             continue
         tree, parents[new] = cut, block
-        settled |= {block: state[~leaves], new: state[leaves]}
+        updates |= {block: state[~leaves], new: state[leaves]}
         waiting += [block, new]
-    return tree, settled, parents
+    return tree, updates, parents
 
 
 def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
@@ -54,7 +54,7 @@ def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
 
 
 def with_full(
-    scene: StoredScene, settled: dict[BlockName, BlockState], limits: Limits, busy: set[int]
+    scene: StoredScene, updates: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
     """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
     these there might be no room in it.
@@ -62,26 +62,28 @@ def with_full(
     Args:
         busy: blocks that are being trained.
     """
-    inbox = settled.get(INBOX)
-    if not limits.block_limit or inbox is None:
-        return settled
-    waiting = split_by_block(inbox, scene.tree.assign(inbox.gaussians.means))
-    at_rest = {block: mail for block, mail in waiting.items() if block not in busy}
-    # A block whose visit has just ended may have mail, too: what came while it was out.
-    rows = {block: len(settled[block]) if block in settled else scene.rows(block) for block in at_rest}
+    pending = updates.get(PENDING)
+    if not limits.block_limit or pending is None:
+        return updates
+    waiting = split_by_block(pending, scene.tree.assign(pending.gaussians.means))
+    at_rest = {block: migrants for block, migrants in waiting.items() if block not in busy}
+    # A block whose visit has just ended may have pending migrants, too: what came while it was out.
+    rows = {block: len(updates[block]) if block in updates else scene.rows(block) for block in at_rest}
     full = {
-        block: mail for block, mail in at_rest.items() if rows[block] + len(mail) > FULL * limits.block_limit
+        block: migrants
+        for block, migrants in at_rest.items()
+        if rows[block] + len(migrants) > FULL * limits.block_limit
     }
     joined = {
-        block: join([settled[block] if block in settled else scene.state(block), mail])
-        for block, mail in full.items()
+        block: join([updates[block] if block in updates else scene.state(block), migrants])
+        for block, migrants in full.items()
     }
-    return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled
+    return {**updates, **joined, PENDING: without(scene, pending, full)} if full else updates
 
 
 def cut_full(
     scene: StoredScene,
-    settled: dict[BlockName, BlockState],
+    updates: dict[BlockName, BlockState],
     state: RunState,
     limits: Limits,
     announce: Announcer,
@@ -89,17 +91,17 @@ def cut_full(
     """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole.
 
     Args:
-        settled: as of `split_full`.
+        updates: as of `split_full`.
 
     Returns:
         The tree with the cuts, and everything to be put to rest.
     """
     busy = {visit.geometry.block for visit in state.in_flight}
-    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limits, busy), limits)
+    tree, updates, parents = split_full(scene.tree, with_full(scene, updates, limits, busy), limits)
     for new, parent in parents.items():
         state.inherit(new, parent)
         announce(BlockSplit(parent, new))
-    return tree, settled
+    return tree, updates
 
 
 def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
@@ -121,7 +123,7 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
             live = scene.state(LIVE)
             large = {block: live, LIVE: live.nobody}
         else:
-            large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
+            large = {block: with_pending(scene, block), **pending_without(scene, {block})}
         tree, parts = cut_full(scene, large, state, limits, Announcer())
         if tree is not scene.tree:
             state.active = active = None if active is None or active.is_joint else active

@@ -13,22 +13,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import Announcer, Mended
+from abcd_ns.engine.events import Announcer, Repaired
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.render.loss import decibels
+from abcd_ns.engine.store.commit import state_for_visit
 from abcd_ns.engine.store.scene import VisitScene
-from abcd_ns.engine.store.settle import state_for_visit
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health.health_rules import (
-    GIANT_ANGLE,
     HIDDEN,
+    OVERSIZED_ANGLE,
     stand_ins,
     unsound,
     wider_than,
 )
 from abcd_ns.engine.train.health.step_guard import StepGuard
-from abcd_ns.engine.train.health_record import BlockHealth, Ledger
+from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Gaussians, View
@@ -58,7 +58,7 @@ class Health:
         self._may_act = may_act
         self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
         self._active: ActiveVisit | None = None
-        self._ledger: Ledger = {}
+        self._health_by_block: HealthByBlock = {}
         self._attached: Tensor | None = None
         self._resumed = False
         self._bad: Tensor | None = None
@@ -69,13 +69,13 @@ class Health:
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
-    def begin_visit(self, active: ActiveVisit, ledger: Ledger) -> None:
+    def begin_visit(self, active: ActiveVisit, health_by_block: HealthByBlock) -> None:
         """A block was attached.
 
         Args:
-            ledger: the run's, to be written to.
+            health_by_block: the run's, to be written to.
         """
-        self._active, self._ledger = active, ledger
+        self._active, self._health_by_block = active, health_by_block
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
         self._clean, self._psnr = LATE_AFTER, math.nan
@@ -101,11 +101,11 @@ class Health:
             return True, self._psnr
         self.count("gradients", int(self._bad.sum()))
         self._bad, self._clean = None, 0
-        self._mend()
+        self._repair()
         return False, self._psnr
 
     @torch.no_grad()
-    def hold_back_giants(self, views: Iterable[View]) -> None:
+    def shrink_oversized(self, views: Iterable[View]) -> None:
         """Shrink Gaussians that are too large for every camera, along the axes that are.
 
         Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
@@ -114,7 +114,7 @@ class Health:
         if not self._may_act:
             return
         scales = self._params["scales"]
-        over, allowed = wider_than(GIANT_ANGLE, scales, self._params["means"], views)
+        over, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
         rows = over.any(dim=1).nonzero()[:, 0]
         if len(rows) == 0:
             return
@@ -137,25 +137,25 @@ class Health:
         return state
 
     def count(self, what: str, count: int) -> None:
-        """So much of the live block had to be mended; see BlockHealth for what."""
+        """So much of the live block had to be repaired; see BlockHealth for what."""
         if count:
             record, active = self._record, self._active
             setattr(record, what, getattr(record, what) + count)
             alone = active is None or active.is_whole
             number = 0 if active is None else active.number
-            self._announce(Mended(number, None if alone else active.geometry.block, what, count))
+            self._announce(Repaired(number, None if alone else active.geometry.block, what, count))
 
     def look_over(self) -> None:
-        """Mend all that is no number in the live block; call when a visit ends, and before saving."""
+        """Repair all that is no number in the live block; call when a visit ends, and before saving."""
         self._read()
-        self._mend()
+        self._repair()
 
     # -- numbers -------------------------------------------------------------------------------------
 
     def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
         if self._guard is not None:
             late = self._clean >= LATE_AFTER and self._guard.works
-            self._guard.tell(optimizer, late)
+            self._guard.record(optimizer, late)
             if late:
                 return
         for parameter in optimizer.param_groups[0]["params"]:
@@ -175,7 +175,7 @@ class Health:
         self._bad = bad if self._bad is None else self._bad | bad
 
     @torch.no_grad()
-    def _mend(self) -> None:
+    def _repair(self) -> None:
         for name, optimizer in self._optimizers.items():
             adam = optimizer.state[self._params[name]]
             for moment in MOMENTS:
@@ -229,10 +229,10 @@ class Health:
             skipped = int(sum(numbers.get("bad", ())))
             if skipped and self._clean >= LATE_AFTER:  # now row by row, so that the others are trained
                 self._clean = 0
-                self._mend()
+                self._repair()
             self.count("gradients", skipped)
 
     @property
     def _record(self) -> BlockHealth:
         block = WHOLE if self._active is None else self._active.geometry.block
-        return self._ledger.setdefault(block, BlockHealth())
+        return self._health_by_block.setdefault(block, BlockHealth())

@@ -14,9 +14,9 @@ STAND_IN_OPACITY = -9.0
 """Logit of the opacity of a Gaussian that takes the place of one that was lost; far below MIN_ALPHA."""
 LARGEST_LOG_SCALE = 40.0
 """A standard deviation of e^40; its square still is a number in float32."""
-GIANT_ANGLE = 0.3
-"""A giant's standard deviation is over this share of its distance to the nearest camera: 3 sigma cover 45
-degrees to either side. What is far away, sky for instance, may be large."""
+OVERSIZED_ANGLE = 0.3
+"""An oversized Gaussian's standard deviation is over this share of its distance to the nearest camera: 3
+sigma cover 45 degrees to either side. What is far away, sky for instance, may be large."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 DISTANCES_AT_ONCE = 1 << 22

@@ -32,7 +32,7 @@ class StepGuard:
         """Whether all optimizers can be told."""
         return all(optimizer.defaults.get("fused") for optimizer in self._optimizers.values())
 
-    def tell(self, optimizer: torch.optim.Optimizer, skips: bool) -> None:
+    def record(self, optimizer: torch.optim.Optimizer, skips: bool) -> None:
         """Call before it steps. The gradients of all are looked at when the first of them does.
 
         Args:

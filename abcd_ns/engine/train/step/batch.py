@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import composite, sandwich
-from abcd_ns.engine.layers.painter import FrozenLayers
+from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.cuda.frame import Frame
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
@@ -88,10 +88,10 @@ class Sample:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
         return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
 
-    def frame(self, weigh: bool) -> Frame:
-        """What the rasterizer's drawing is shown in; with `weigh` as in `weighed`."""
+    def frame(self, blend_weights: bool) -> Frame:
+        """What the rasterizer's drawing is shown in; with `blend_weights` as in `with_blend_weights`."""
         front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
-        return Frame(front, back, self.background, weigh / self.share)
+        return Frame(front, back, self.background, blend_weights / self.share)
 
     def residual(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w c"]

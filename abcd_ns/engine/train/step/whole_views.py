@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.painter import PaintSettings
+from abcd_ns.engine.layers.layer_renderer import RenderSettings
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.capture.light import lit
-from abcd_ns.engine.train.layer_source import painter_of, parts_bytes
+from abcd_ns.engine.train.layer_source import parts_bytes, renderer_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import View
@@ -43,8 +43,8 @@ class WholeViews:
         run = self._run
         # Half of what a visit's have: here a view is drawn backward beside them.
         room = parts_bytes(run, views, run.blocks, share=0.5)
-        painter = painter_of(run, scene, views)
-        return WholePictures(painter, PaintSettings(run.sh_degree, run.config.antialiased), room)
+        renderer = renderer_of(run, scene, views)
+        return WholePictures(renderer, RenderSettings(run.sh_degree, run.config.antialiased), room)
 
     def beside(
         self, view: View, shown: Float[Tensor, "h w 3"]

@@ -1,6 +1,6 @@
-"""A last shedding: when a run is complete, what its pictures hardly miss is taken out.
+"""Final pruning: when a run is complete, remove what its pictures hardly miss.
 
-Shedding in training (density/shedding) ends while there is time to make good what is missed, so that more is
+Pruning in training (density/pruning) ends while there is time to make good what is missed, so that more is
 in a scene at its end than its pictures need. RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et al.,
 NeurIPS 2024) and Speedy-Splat (Hanson et al., CVPR 2025) leave out a given share of what ranks lowest. Here
 the pictures say how many: as many as training views can spare.
@@ -19,11 +19,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import PhotosWanted, ShedAtEnd, Shedding
+from abcd_ns.engine.events import PhotosWanted, PrunedAtEnd, Pruning
 from abcd_ns.engine.render import Raster
+from abcd_ns.engine.store.commit import pending_without, with_pending
 from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.store.settle import inbox_without, with_mail
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
@@ -61,8 +61,8 @@ class _Probe:
             self._leaves[block] = gaussians.opacities.detach().clone().clamp_(max=OPAQUE).requires_grad_()
         return replace(gaussians, opacities=self._leaves[block])
 
-    def take_note(self) -> None:
-        """A view has been drawn backward, or what a unit shows in it: a pixel has each Gaussian in one."""
+    def accumulate(self) -> None:
+        """A view has been drawn backward, or what a node shows in it: a pixel has each Gaussian in one."""
         for block, logits in self._leaves.items():
             if logits.grad is None:
                 continue
@@ -77,7 +77,7 @@ class _Probe:
         return torch.zeros(len(scene.gaussians(block))) if found is None else found.cpu()
 
 
-class LastShedding:
+class FinalPruning:
     """Takes out of a run's scene, all of it at rest, as many Gaussians as cost LOSS at most.
 
     Args:
@@ -93,7 +93,7 @@ class LastShedding:
         density = self._run.density.config
         return density.price > 0 and density.strategy != "off"
 
-    def take(self) -> None:
+    def run(self) -> None:
         """Do it; tells listeners how many went, and at what cost."""
         run = self._run
         views, step = self._whole.views(), run.state.step
@@ -117,8 +117,8 @@ class LastShedding:
             else:
                 many = number
         del scene
-        gone = sum(self._take_out(block, of_block, price) for block, of_block in enumerate(worth))
-        run.announce(ShedAtEnd(gone, run.count(), len(views), before, after))
+        gone = sum(self._prune_block(block, of_block, price) for block, of_block in enumerate(worth))
+        run.announce(PrunedAtEnd(gone, run.count(), len(views), before, after))
 
     def _room(self, views: Sequence[View]) -> int:
         """Of a device, for blocks that are held there while none is live: a third of what a live one has."""
@@ -146,9 +146,9 @@ class LastShedding:
             return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
 
         for group in pictures.groups(chosen):
-            run.announce(Shedding(0, ROUNDS + 1))
+            run.announce(Pruning(0, ROUNDS + 1))
             run.announce(PhotosWanted(tuple(view.index for view in group)))
-            pictures.backward(group, gradient, probe.take_note)
+            pictures.backward(group, gradient, probe.accumulate)
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
         worth = [PER_NEPER / len(chosen) * probe.worth(block, scene) for block in blocks]
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
@@ -168,7 +168,7 @@ class LastShedding:
         found = []
         self._run.announce(PhotosWanted(tuple(view.index for view in views)))
         for view, picture in zip(views, pictures.draw(views), strict=True):
-            self._run.announce(Shedding(rounds, ROUNDS + 1))
+            self._run.announce(Pruning(rounds, ROUNDS + 1))
             square, counts = self._square(view, picture)
             error = square / (3 * counts.sum()).clamp_min(1.0)
             found.append(-10 * error.clamp_min(LEAST_ERROR).log10())
@@ -179,15 +179,15 @@ class LastShedding:
         seen, photo, counts = self._whole.beside(view, picture.color.detach())
         return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts
 
-    def _take_out(self, block: int, worth: Float[Tensor, "n"], price: float) -> int:
-        """Put a block to rest with its mail, without who is worth no more than a price; tells how many."""
+    def _prune_block(self, block: int, worth: Float[Tensor, "n"], price: float) -> int:
+        """Put a block to rest with its migrants, without those worth at most `price`; return how many."""
         run, scene = self._run, self._run.scene
         gone = int((worth <= price).sum())
         if gone:
-            state = with_mail(scene, block)
-            stays = state.waits.clone()  # who is not drawn
-            stays[~state.waits] = worth > price
-            run.rest(scene.tree, {block: state[stays], **inbox_without(scene, {block})}, within=0.0)
+            state = with_pending(scene, block)
+            stays = state.deferred.clone()  # who is not drawn
+            stays[~state.deferred] = worth > price
+            run.rest(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone
 
 

@@ -1,11 +1,11 @@
-"""Shedding: a Gaussian that fills less of its views than its price is taken out.
+"""Pruning: remove a Gaussian whose contribution to its views is below the minimum.
 
 What a Gaussian weighs in a picture is the sum over pixels of alpha T, the transmittance of whatever lies
-before its block included: so many pixels it fills. Drawings that train it tell for nothing (see `weighed`).
-Added up over the views of its block it says what would be missing without it, as RadSplat (Niemeyer et al.,
-2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the sum of such weights when
-training ends. Here they go while it goes on, at a price that rises as growth comes to its end: those that
-remain take their place, and each step costs less.
+before its block included: so many pixels it fills. Drawings that train it tell for nothing (see
+`with_blend_weights`). Added up over the views of its block it says what would be missing without it, as
+RadSplat (Niemeyer et al., 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the
+sum of such weights when training ends. Here they go while it goes on, at a price that rises as growth comes
+to its end: those that remain take their place, and each step costs less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render import Raster
 
-WEIGHED = ("weight", "passes")
+BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
 trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
 scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though
@@ -28,13 +28,13 @@ FULL_PASS = 0.999
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 FAINT, FAINTER = 0.1, 0.25
-"""What fills more than most is haze if its opacity is below the first, and below this share of the median: at
-first all are faint."""
+"""What fills more than most is a floater if its opacity is below the first, and below this share of the
+median: at first all are faint."""
 PASSES = 4
 """A block that is the whole scene is judged whenever each of its views was drawn so often."""
 
 
-class _Weigh(torch.autograd.Function):
+class _BlendWeight(torch.autograd.Function):
     """The colour as it is; whatever the loss, the depth's gradient is what a pixel counts for."""
 
     @staticmethod
@@ -48,21 +48,21 @@ class _Weigh(torch.autograd.Function):
         return grad, ctx.saved_tensors[0], None
 
 
-def weighed(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float) -> Raster:
+def with_blend_weights(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float) -> Raster:
     """The same drawing; backward leaves what each Gaussian weighs in its picture in `info["weights"].grad`.
 
     Args:
-        raster: drawn with `weigh`.
+        raster: drawn with `blend_weights`.
         in_front: transmittance of what lies before it; None for nothing.
         share: of the pixels that might have been drawn, those that are.
     """
     counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
-    color = _Weigh.apply(raster.color, raster.depth, counts.detach() / share)
+    color = _BlendWeight.apply(raster.color, raster.depth, counts.detach() / share)
     return Raster(color, raster.transmittance, raster.depth, raster.info)
 
 
-def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
-    """What drawings add to WEIGHED, after backward; each [n]. Nothing if they were drawn without weighing.
+def blend_sums(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
+    """What drawings add to BLEND_SUMS, after backward; each [n]. Nothing if they were drawn without weighing.
 
     Args:
         views: that the block is trained on.
@@ -73,45 +73,45 @@ def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
     weight = torch.cat(found).sum(dim=0)
     passes = torch.full_like(weight, sum(len(weights) for weights in found) / views)
     # An accelerator may have skipped a step that was no number.
-    return dict(zip(WEIGHED, (weight.nan_to_num(0.0, 0.0, 0.0), passes), strict=True))
+    return dict(zip(BLEND_SUMS, (weight.nan_to_num(0.0, 0.0, 0.0), passes), strict=True))
 
 
-def are_weighed(growth: Mapping[str, Tensor]) -> bool:
+def have_contributions(growth: Mapping[str, Tensor]) -> bool:
     """Whether the statistics say anything of weights."""
-    return all(name in growth for name in WEIGHED)
+    return all(name in growth for name in BLEND_SUMS)
 
 
-def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
+def contributions(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
     """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet: such
     a one is not judged, for no comparison finds it to be less.
 
     Args:
-        growth: with WEIGHED.
+        growth: with BLEND_SUMS.
     """
-    weight, passes = (growth[name] for name in WEIGHED)
+    weight, passes = (growth[name] for name in BLEND_SUMS)
     return torch.where(passes >= FULL_PASS, weight / passes, torch.nan)
 
 
 def faded(growth: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
-    if not are_weighed(growth):
+    if not have_contributions(growth):
         return dict(growth)
     half = torch.where(growth["passes"] >= FULL_PASS, 0.5, 1.0)
-    return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
+    return {name: value * half if name in BLEND_SUMS else value for name, value in growth.items()}
 
 
-def haze(
+def floaters(
     growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint: float = FAINT
 ) -> Bool[Tensor, "n"]:
     """Which Gaussians are faint and fill more of their block's views than the mean: clouds before cameras, by
     which the light of single photos is imitated, and which other views look through.
 
     Args:
-        growth: with WEIGHED.
+        growth: with BLEND_SUMS.
         opacities: after the sigmoid.
         faint: the opacity below which one is, and below FAINTER of their median.
     """
-    full = fills(growth)
+    full = contributions(growth)
     return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
 
 

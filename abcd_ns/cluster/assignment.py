@@ -1,4 +1,4 @@
-"""What passes between the one who lends blocks and those who train them."""
+"""What passes between the dispatcher, which assigns blocks, and its workers."""
 
 import time
 from abc import ABC, abstractmethod
@@ -14,7 +14,7 @@ from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.lent_scene import Outlines
+from abcd_ns.engine.store.assigned_scene import Outlines
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import Gaussians
@@ -33,7 +33,7 @@ class VisitTask:
     active: ActiveVisit
     tree: BlockTree
     outlines: Outlines
-    """Of all blocks, at the moment they are lent."""
+    """Of all blocks, at the moment they are assigned."""
     step: int
     """Steps of the run before the visit's first one."""
     seconds: float
@@ -89,11 +89,11 @@ class Parcel:
 
 
 @dataclass(frozen=True)
-class Lease:
-    """A visit in the hands of a worker. It ends when the worker answers, or is given up."""
+class Assignment:
+    """A visit assigned to a worker. It ends when the worker answers, or is given up."""
 
     number: int
-    """No other lease of the run has it: an answer to one that was given up is known by that."""
+    """No other assignment of the run has it: an answer to one that was given up is known by that."""
     task: VisitTask
     state: Callable[[], BlockState]
     """Reads what the visit begins with, wherever the worker is."""
@@ -105,7 +105,7 @@ class Lease:
 class StepsSeen:
     """A worker is at it."""
 
-    lease: int
+    assignment: int
     done: int
     psnr: float
     """Of the last one, dB."""
@@ -115,7 +115,7 @@ class StepsSeen:
 class Finished:
     """A worker has answered."""
 
-    lease: int
+    assignment: int
     outcome: VisitOutcome
 
 
@@ -123,7 +123,7 @@ class Finished:
 class Lost:
     """A worker is gone, or too long silent, and with it what it was at."""
 
-    lease: int
+    assignment: int
     why: str
 
 
@@ -135,7 +135,7 @@ class Member:
     """A worker, or the place for one. Times are of `time.monotonic`."""
 
     number: int
-    lease: Lease | None = None
+    assignment: Assignment | None = None
     """What it trains."""
     done: int = 0
     """Steps of its visit so far."""
@@ -152,21 +152,21 @@ class Member:
     @property
     def is_idle(self) -> bool:
         """Whether it could take a visit now."""
-        return self.ready and self.lease is None
+        return self.ready and self.assignment is None
 
-    def take(self, lease: Lease) -> None:
+    def take(self, assignment: Assignment) -> None:
         """Begin a visit."""
         self.waited += time.monotonic() - self.free_since
-        self.lease, self.done = lease, 0
+        self.assignment, self.done = assignment, 0
 
-    def put_down(self) -> Lease:
+    def put_down(self) -> Assignment:
         """End the visit, whatever became of it."""
-        lease, self.lease, self.free_since = self.lease, None, time.monotonic()
-        return lease
+        assignment, self.assignment, self.free_since = self.assignment, None, time.monotonic()
+        return assignment
 
     def seen(self) -> WorkerSeen:
         """What it is doing."""
-        now, visit = time.monotonic(), self.lease and self.lease.task.active
+        now, visit = time.monotonic(), self.assignment and self.assignment.task.active
         waited = self.waited + (now - self.free_since if self.is_idle else 0.0)
         share = min(waited / max(now - self.since, 1e-9), 1.0) if self.since else 0.0
         block, steps = (visit.geometry.block, visit.steps) if visit else (None, 0)
@@ -195,21 +195,21 @@ class Workers(ABC, Generic[M]):
     @property
     def pids(self) -> list[int]:
         """Processes of those that train."""
-        return [member.pid for member in self._members if member.lease is not None]
+        return [member.pid for member in self._members if member.assignment is not None]
 
     @abstractmethod
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """What reads this wherever a worker is, as long as the caller keeps it."""
 
     @abstractmethod
-    def submit(self, lease: Lease) -> None:
+    def submit(self, assignment: Assignment) -> None:
         """Give a visit to the one that has been idle for longest."""
 
     def hold(self) -> bool:
         """Stop those that train; whether that can be done. Harmless when done twice."""
-        return not any(member.lease is not None for member in self._members)
+        return not any(member.assignment is not None for member in self._members)
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Let those that were stopped continue; to be called before `wait` and `submit`."""
 
     @abstractmethod

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers.compositing import fold
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.intervals import ray_interval
@@ -23,14 +23,14 @@ PRIMITIVES = ["3dgs", "2dgs"]
 DRAWS = {(p, side): TorchRasterizer(tile_side=side, primitive=p) for p in PRIMITIVES for side in (1, 4, 16)}
 """Rasterizers by primitive, and by the side of their tiles, and so of their windows."""
 BOTH = pytest.mark.parametrize("primitive", PRIMITIVES)
-SETTINGS = PaintSettings(sh_degree=1)
+SETTINGS = RenderSettings(sh_degree=1)
 
 
-def painter(
+def layer_renderer(
     tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0, draw=DRAW
-) -> Painter:
+) -> LayerRenderer:
     scene = MemoryScene(tree, gaussians)
-    return Painter(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
+    return LayerRenderer(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
 
 
 def merged(gaussians: Gaussians, view: View, draw=DRAW) -> Layer:
@@ -77,9 +77,9 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(primitive, tree, dt
     }[tree]()
     views = views_in_and_out(dtype)
     draw = DRAWS[primitive, side]
-    paint = painter(cut, gaussians, views, draw=draw)
+    renderer = layer_renderer(cut, gaussians, views, draw=draw)
     for view in views:
-        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view, draw)) < tolerance
+        assert difference(renderer.picture(view, SETTINGS), merged(gaussians, view, draw)) < tolerance
 
 
 @pytest.mark.parametrize("side", [4, 16])
@@ -111,41 +111,41 @@ def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(primiti
 def test_how_many_blocks_share_a_pass_changes_nothing_by_fragments(pass_gaussians):
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
-    paint = painter(build_kd(gaussians.means, 8), gaussians, views, pass_gaussians=pass_gaussians)
-    assert (len(paint.units()) == 1) == (pass_gaussians >= 200)
+    renderer = layer_renderer(build_kd(gaussians.means, 8), gaussians, views, pass_gaussians=pass_gaussians)
+    assert (len(renderer.nodes()) == 1) == (pass_gaussians >= 200)
     for view in views:
-        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
+        assert difference(renderer.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
 
 
 def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():
     gaussians = random_gaussians(200, size=0.15, dtype=torch.float64)
     (view,) = ring_of_views(1, dtype=torch.float64)
     tree = build_kd(gaussians.means, 6)
-    paint = painter(tree, gaussians, [view], ownership="means")
+    renderer = layer_renderer(tree, gaussians, [view], ownership="means")
     owner = tree.assign(gaussians.means)
     color, light = torch.zeros(36, 48, 3, dtype=torch.float64), torch.ones(36, 48, dtype=torch.float64)
-    for unit in paint.order(paint.units(), view):
-        (block,) = tree.leaves(unit)
+    for node in renderer.order(renderer.nodes(), view):
+        (block,) = tree.leaves(node)
         layer = merged(gaussians[owner == block], view)
         color, light = color + light[..., None] * layer.color, light * layer.transmittance
-    assert difference(paint.picture(view, SETTINGS), Layer(color, light)) < 1e-12
+    assert difference(renderer.picture(view, SETTINGS), Layer(color, light)) < 1e-12
     assert difference(Layer(color, light), merged(gaussians, view)) > 1e-3
 
 
 @pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (10_000, 4), (60, 16)])
 @BOTH
 def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pass_gaussians, side):
-    """Wherever the window lies, and however many units share the frozen blocks."""
+    """Wherever the window lies, and however many nodes share the frozen blocks."""
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
     tree = build_kd(gaussians.means, 8)
     owner = tree.assign(gaussians.means)
     own, frozen = gaussians[owner == 3], gaussians[owner != 3]
     draw = DRAWS[primitive, side]
-    paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
-    units = paint.units(exclude=3)
-    loaded = {unit: paint.load(unit, exclude=3) for unit in units}
-    assert sum(unit.own for unit in loaded.values()) == len(frozen)
+    renderer = layer_renderer(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
+    nodes = renderer.nodes(exclude=3)
+    loaded = {node: renderer.load(node, exclude=3) for node in nodes}
+    assert sum(node.own for node in loaded.values()) == len(frozen)
     for view in views:
         windows = [
             ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
@@ -154,10 +154,10 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
         for window in windows:
             seen = [Seen(view, view.full, window)]
             parts = {}
-            for unit in units:
-                parts[unit] = next(paint.paint(unit, loaded[unit], seen, SETTINGS, active=3))
-                paint.fold_up(parts, unit, view)
-            cut = paint.fold(parts, view, view.full)
+            for node in nodes:
+                parts[node] = next(renderer.render(node, loaded[node], seen, SETTINGS, active=3))
+                renderer.fold_up(parts, node, view)
+            cut = renderer.fold(parts, view, view.full)
             splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
             assert splats.unique(dim=1).shape == splats.shape
             with torch.no_grad():
@@ -170,31 +170,31 @@ def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():
     gaussians = random_gaussians(150, size=0.1)
     (view,) = ring_of_views(1)
     tree = build_kd(gaussians.means, 4)
-    expected = painter(tree, gaussians, [view]).picture(view, SETTINGS)
+    expected = layer_renderer(tree, gaussians, [view]).picture(view, SETTINGS)
     generator = torch.Generator().manual_seed(3)
     shuffled = gaussians[torch.randperm(150, generator=generator)]
     halved = tree.split(2, axis=0, threshold=float(tree.cell(2).contains(gaussians.means).float().mean()))
     with_empty = tree.split(0, axis=2, threshold=-50.0)
     for other_tree, scene in ((tree, shuffled), (halved, gaussians), (with_empty, gaussians)):
-        assert difference(painter(other_tree, scene, [view]).picture(view, SETTINGS), expected) < 1e-6
+        assert difference(layer_renderer(other_tree, scene, [view]).picture(view, SETTINGS), expected) < 1e-6
 
 
 def test_a_crop_of_a_layer_is_the_layers_crop():
     gaussians = random_gaussians(150, size=0.1)
     (view,) = ring_of_views(1)
-    paint = painter(build_kd(gaussians.means, 5), gaussians, [view])
-    whole, crop = paint.picture(view, SETTINGS), Crop(16, 16, 32, 16)
-    part = paint.picture(view, SETTINGS, crop)
+    renderer = layer_renderer(build_kd(gaussians.means, 5), gaussians, [view])
+    whole, crop = renderer.picture(view, SETTINGS), Crop(16, 16, 32, 16)
+    part = renderer.picture(view, SETTINGS, crop)
     assert torch.equal(part.color, whole.color[crop.slices])
     assert torch.equal(part.transmittance, whole.transmittance[crop.slices])
 
 
-def test_giants_and_far_gaussians_are_drawn_in_every_cell_they_reach():
+def test_oversized_gaussians_and_far_gaussians_are_drawn_in_every_cell_they_reach():
     gaussians = translucent(100, 0.05)
     gaussians.scales[:3] = math.log(1.5)
     gaussians.means[3:6] *= 40.0
     gaussians.scales[3:6] = math.log(8.0)
     views = views_in_and_out(torch.float64)
-    paint = painter(build_kd(gaussians.means, 8), gaussians, views)
+    renderer = layer_renderer(build_kd(gaussians.means, 8), gaussians, views)
     for view in views:
-        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
+        assert difference(renderer.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12

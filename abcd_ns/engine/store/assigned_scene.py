@@ -1,4 +1,4 @@
-"""A scene as it was at one moment, lent to whoever trains a visit apart from it."""
+"""A scene as one immutable snapshot, assigned to a worker that trains a visit."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Outlines:
     """See BlockScene."""
 
 
-class LentScene(VisitScene):
+class AssignedScene(VisitScene):
     """The blocks of a moment: one with all that its training goes on from, the others to be drawn.
 
     Args:
@@ -43,35 +43,35 @@ class LentScene(VisitScene):
         self._live: Callable[[], Gaussians] | None = None
 
     def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
-        """From now on the lent block is what `live` returns.
+        """From now on the assigned block is what `live` returns.
 
         Raises:
             ValueError: another block.
         """
         if block != self._block:
-            raise ValueError(f"block {self._block} was lent, not {block}")
+            raise ValueError(f"block {self._block} was assigned, not {block}")
         self._live = live
 
     def state(self, name: BlockName) -> BlockState:
-        """The lent block as its visit found it.
+        """The assigned block as its visit found it.
 
         Raises:
             KeyError: another one: no more than its Gaussians is known.
         """
         if name != self._block:
-            raise KeyError(f"block {self._block} was lent, not {name}")
+            raise KeyError(f"block {self._block} was assigned, not {name}")
         return self._state
 
-    def mail(self, block: int) -> BlockState | None:  # noqa: ARG002 - the lent block has had it
+    def pending_for(self, block: int) -> BlockState | None:  # noqa: ARG002 - the assigned block has had it
         """Nobody waits."""
         return None
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians of the lent block as its visit found it."""
+        """Gaussians of the assigned block as its visit found it."""
         return len(self.state(name))
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
-        """The lent block as its visit found it."""
+        """The assigned block as its visit found it."""
         return self.state(block).gaussians
 
     def gaussians(self, block: int) -> Gaussians:
@@ -80,7 +80,7 @@ class LentScene(VisitScene):
         return self._read_as_drawn(block)
 
     def as_drawn(self) -> Gaussians:
-        """The lent block as others draw it: without Gaussians that join in this visit."""
+        """The assigned block as others draw it: without Gaussians that join in this visit."""
         return self._read_as_drawn(self._block)
 
     def _read_as_drawn(self, block: int) -> Gaussians:

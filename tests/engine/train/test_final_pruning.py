@@ -5,21 +5,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import ShedAtEnd, Shedding
+from abcd_ns.engine.events import PrunedAtEnd, Pruning
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.step import last_shedding
-from abcd_ns.engine.train.step.last_shedding import LastShedding, _Probe, random_signs
+from abcd_ns.engine.train.step import final_pruning
+from abcd_ns.engine.train.step.final_pruning import FinalPruning, _Probe, random_signs
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
-"""Nothing grows, and training sheds nobody that fills anything."""
+"""Nothing grows, and training prunes nobody that fills anything."""
 VIEWS, FAINT = 5, 30
-"""Fewer views than a last shedding looks at: it looks at all of them."""
+"""Fewer views than a final pruning looks at: it looks at all of them."""
 
 
 def scene() -> Gaussians:
@@ -62,8 +62,8 @@ def mean_psnr(coordinator, views, photos) -> float:
     return float(sum(psnr(p, photos.images[v.index]) for p, v in zip(pictures, views, strict=True))) / VIEWS
 
 
-def at_end(told) -> ShedAtEnd:
-    (event,) = [event for event in told if isinstance(event, ShedAtEnd)]
+def at_end(told) -> PrunedAtEnd:
+    (event,) = [event for event in told if isinstance(event, PrunedAtEnd)]
     return event
 
 
@@ -72,24 +72,24 @@ def at_end(told) -> ShedAtEnd:
 )
 def test_as_many_go_as_training_views_can_spare(complete, views, photos, monkeypatch, options):
     with monkeypatch.context() as patched:
-        patched.setattr(LastShedding, "is_wanted", False)
+        patched.setattr(FinalPruning, "is_wanted", False)
         all_of_it, _ = complete("all", **options)
     coordinator, told = complete("shed", **options)
     found = at_end(told)
     assert found.gone >= FAINT // 3
     assert coordinator.count() == found.gaussians == len(whole_scene(coordinator))
     assert found.gaussians == all_of_it.count() - found.gone
-    # By units a picture is the merged one, but for the 1e-4 of light at which drawing stops.
+    # By nodes a picture is the merged one, but for the 1e-4 of light at which drawing stops.
     assert mean_psnr(all_of_it, views, photos) == pytest.approx(found.before, abs=0.005)
     assert mean_psnr(coordinator, views, photos) == pytest.approx(found.after, abs=0.005)
     assert found.before - found.after <= 0.05
-    assert not [event for event in told[told.index(found) :] if isinstance(event, Shedding)]
+    assert not [event for event in told[told.index(found) :] if isinstance(event, Pruning)]
 
 
 def test_the_more_it_may_cost_the_more_go(complete, monkeypatch):
     counts = []
     for loss in (0.01, 0.3, 3.0):
-        monkeypatch.setattr(last_shedding, "LOSS", loss)
+        monkeypatch.setattr(final_pruning, "LOSS", loss)
         _, told = complete(f"{loss}")
         assert at_end(told).before - at_end(told).after <= loss
         counts.append(at_end(told).gone)
@@ -121,7 +121,7 @@ def test_what_is_opaque_is_not_taken_for_what_does_not_show(complete):
 def test_options_keep_everything(complete, density):
     coordinator, told = complete(steps=10, density=replace(STILL, **density))
     assert coordinator.count() == 120
-    assert not [event for event in told if isinstance(event, ShedAtEnd)]
+    assert not [event for event in told if isinstance(event, PrunedAtEnd)]
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
@@ -130,7 +130,7 @@ def test_a_complete_run_goes_on_with_those_that_are_left(complete, begin, photos
     left = whole_scene(coordinator)
     coordinator.close()
     longer = begin(steps=80, blocks=blocks, resume=True)
-    again = listen(longer, ShedAtEnd)
+    again = listen(longer, PrunedAtEnd)
     assert torch.equal(whole_scene(longer).means, left.means)
     train(longer, photos, steps=5)
     assert longer.count() == at_end(told).gaussians
@@ -150,14 +150,16 @@ def test_a_run_that_is_killed_in_it_does_it_anew_and_once(begin, photos, monkeyp
 
     coordinator = begin(blocks=4)
     with monkeypatch.context() as patched:
-        take_out = LastShedding._take_out
-        patched.setattr(LastShedding, "_take_out", lambda self, *of: killed_at(*of) or take_out(self, *of))
+        prune_block = FinalPruning._prune_block
+        patched.setattr(
+            FinalPruning, "_prune_block", lambda self, *of: killed_at(*of) or prune_block(self, *of)
+        )
         with pytest.raises(KilledError):
             train(coordinator, photos)
     coordinator.close()
     for times in (1, 0):
         again = begin(blocks=4, resume=True)
-        told = listen(again, ShedAtEnd)
+        told = listen(again, PrunedAtEnd)
         assert again.finished
         train(again, photos)
         again.complete()
@@ -167,7 +169,7 @@ def test_a_run_that_is_killed_in_it_does_it_anew_and_once(begin, photos, monkeyp
 
 def test_a_run_whose_time_is_up_between_two_looks_is_complete_all_the_same(begin, photos):
     coordinator = begin(blocks=2)
-    told = listen(coordinator, ShedAtEnd)
+    told = listen(coordinator, PrunedAtEnd)
     while coordinator.state.step == 0 or coordinator.state.active is not None:
         train(coordinator, photos, steps=1)
     assert not coordinator.finished
@@ -180,13 +182,13 @@ def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian
     """In the mean over many signs, of a Gaussian at a time."""
     coordinator, _ = complete(steps=5, density=replace(STILL, price=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, views[0]
-    whole = coordinator._last._whole
+    whole = coordinator._final_pruning._whole
     probed, signs = _Probe(), random_signs(0)
     pictures = whole.pictures([view], ChangedScene(coordinator.scene, probed.with_leaf))
     times = 400
     for _ in range(times):
         pictures.backward([view], lambda _, picture: signs(picture.color.shape).to(picture.color))
-        probed.take_note()
+        probed.accumulate()
     found = probed.worth(0, coordinator.scene) / times
     with torch.no_grad():
         before = draw(everything, view, sh_degree=1).color

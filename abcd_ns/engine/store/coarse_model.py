@@ -1,8 +1,8 @@
 """The warm-up: as many Gaussians as the memory of one visit holds, all over the scene, trained at once.
 
 Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
-visits are spent on that. A scaffold is a coarse picture of everything that fits where one block fits, needs
-no layers, and takes little of the time. The remaining Gaussians wait in reserve, then each in its block,
+visits are spent on that. A coarse model is a coarse picture of everything that fits where one block fits,
+needs no layers, and takes little of the time. The remaining Gaussians are deferred, then each in its block,
 unseen until that is visited for the first time: neighbours look to each other as they were trained to look.
 """
 
@@ -16,25 +16,25 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import split_off
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.special_blocks import RESERVE, BlockName
+from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians
 
 BEGINS = 0.6
-"""Of what has room in a scaffold, as a share, where there is more: what grows where it is needed is worth
+"""Of what has room in a coarse model, as a share, where there is more: what grows where it is needed is worth
 more than points at random."""
 REVEALED_OPACITY = 0.02
-"""Of a Gaussian from the reserve, once it is seen: enough to be drawn and to learn, too little to spoil what
-is there."""
+"""Of a Gaussian of the deferred points, once it is seen: enough to be drawn and to learn, too little to spoil
+what is there."""
 REVEALED_SCALE = 0.5
 """Its size, as a share of the distance to its neighbours."""
 
 
-def put_to_wait(reserve: BlockState) -> BlockState:
-    """The reserve as it joins a trained scaffold: small, faint, and unseen until its block is visited."""
-    old = reserve.gaussians
+def defer(points: BlockState) -> BlockState:
+    """Deferred points as they join the coarse model: small, faint, unseen until their block is visited."""
+    old = points.gaussians
     faint = torch.full_like(old.opacities, math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY)))
     small = replace(old, opacities=faint, scales=old.scales + math.log(REVEALED_SCALE))
-    return replace(reserve, gaussians=small, waits=torch.ones_like(reserve.waits))
+    return replace(points, gaussians=small, deferred=torch.ones_like(points.deferred))
 
 
 def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
@@ -48,14 +48,14 @@ def blocks_at_rest(
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
 
     Args:
-        room: for Gaussians in the scaffold. If not all have room, it begins with `BEGINS` of as many, so that
-            it can grow; the others are in reserve. None for no warm-up.
+        room: for Gaussians in the coarse model. If not all have room, it begins with `BEGINS` of as many, so
+            that it can grow; the others are deferred. None for no warm-up.
     """
     if room is None:
         at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
     begins = len(gaussians) if len(gaussians) <= room else math.ceil(BEGINS * room)
-    scaffold, waiting = split_off(gaussians, begins, seed)
-    reserve = BlockState.fresh(waiting).packed()
-    return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}
+    coarse_model, deferred = split_off(gaussians, begins, seed)
+    points = BlockState.fresh(deferred).packed()
+    return {**blocks_at_rest(tree, coarse_model), DEFERRED: points}

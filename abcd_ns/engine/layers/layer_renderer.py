@@ -26,7 +26,7 @@ from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 Ownership = Literal["fragments", "means"]
 PARTS_BYTES = 256 << 20
-"""Size of the layers held while units are folded, at most, unless those of a single view are larger, or there
+"""Size of the layers held while nodes are folded, at most, unless those of a single view are larger, or there
 is more room for them. Each group of views that has room loads the scene once."""
 BYTES_PER_PIXEL = 32
 """Of a front and a back layer in float32, or of one with its depth."""
@@ -35,7 +35,7 @@ LEAST_PASS = 200_000
 
 
 @dataclass(frozen=True)
-class PaintSettings:
+class RenderSettings:
     """What every drawing of a run has in common, under rasterizers' names for it."""
 
     sh_degree: int
@@ -44,12 +44,12 @@ class PaintSettings:
 
 @dataclass(frozen=True)
 class FrozenLayers:
-    """What one view sees of a unit, cut by the active block's window."""
+    """What one view sees of a node, cut by the active block's window."""
 
     front: Layer
     back: Layer
     inside: Splats | None = None
-    """The unit's own Gaussians that have fragments in the window, if there are any; None by means."""
+    """The node's own Gaussians that have fragments in the window, if there are any; None by means."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +64,21 @@ class Seen:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A unit's Gaussians on the device."""
+    """A node's Gaussians on the device."""
 
     gaussians: Gaussians
-    """Its own, then those of other units that reach into it."""
+    """Its own, then those of other nodes that reach into it."""
     own: int
     """How many are its own."""
     seen: frozenset[int] | None = None
-    """Indices of the views that may see something of the unit, or None if that was not asked."""
+    """Indices of the views that may see something of the node, or None if that was not asked."""
 
     def shows_in(self, view: View) -> bool:
-        """Whether `view` may see something of the unit; False is certain."""
+        """Whether `view` may see something of the node; False is certain."""
         return len(self.gaussians) > 0 and (self.seen is None or view.index in self.seen)
 
 
-class Painter:
+class LayerRenderer:
     """Draws the frozen blocks of a scene.
 
     Args:
@@ -113,7 +113,7 @@ class Painter:
         """What crops look at, for `load`."""
         return Frusta(seen, self.rasterizer.slack)
 
-    def units(self, exclude: int | None = None) -> tuple[int, ...]:
+    def nodes(self, exclude: int | None = None) -> tuple[int, ...]:
         """Nodes of the tree that tile space and hold every block but `exclude`, each to be drawn in one pass.
 
         Where no other node holds the cell of `exclude` it is one of them: by fragments for what reaches into
@@ -121,26 +121,26 @@ class Painter:
         """
         return tuple(self._descend(0, exclude))
 
-    def depth_of(self, unit: int) -> int:
-        """How many nodes are above a unit."""
+    def depth_of(self, node: int) -> int:
+        """How many nodes are above a node."""
         depth = 0
-        while unit:
-            unit, depth = int(self.tree.parent[unit]), depth + 1
+        while node:
+            node, depth = int(self.tree.parent[node]), depth + 1
         return depth
 
-    def load(self, unit: int, exclude: int | None = None, seen_by: Frusta | None = None) -> Loaded:
-        """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in.
+    def load(self, node: int, exclude: int | None = None, seen_by: Frusta | None = None) -> Loaded:
+        """On the device: the Gaussians of the node's blocks and, by fragments, all others that reach in.
 
         Args:
             seen_by: keep to blocks of which something may show in these crops; others are not even read.
         """
-        inside = [b for b in self.tree.leaves(unit) if b != exclude]
+        inside = [b for b in self.tree.leaves(node) if b != exclude]
         outside: list[int] = []
-        if self.ownership == "fragments" and unit != 0:
+        if self.ownership == "fragments" and node != 0:
             outside = [b for b in range(self.tree.num_blocks) if b not in set(inside) and b != exclude]
         seen = None
         if seen_by is not None:
-            shown = self._shown(unit, [*inside, *outside], seen_by)
+            shown = self._shown(node, [*inside, *outside], seen_by)
             inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
             seen = frozenset(
                 view.index
@@ -148,16 +148,16 @@ class Painter:
                 if any(row[k] for row in shown.values())
             )
         parts = [self.scene.drawn(block, self.device) for block in inside]
-        own, box = sum(map(len, parts)), self.tree.box(unit)
+        own, box = sum(map(len, parts)), self.tree.box(node)
         parts += [self.scene.drawn(block, self.device, partial(self._reach, box)) for block in outside]
         return Loaded(Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device), own, seen)
 
-    def _shown(self, unit: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
-        """Of these blocks, those with fragments in the unit that some crop may show, and which crops."""
+    def _shown(self, node: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
+        """Of these blocks, those with fragments in the node that some crop may show, and which crops."""
         known = ((b, self.scene.bounds(b)) for b in blocks)
         boxes = {b: self._optics.drawn_within(bounds) for b, bounds in known if bounds is not None}
         if self.ownership == "fragments":
-            space = self.tree.box(unit)
+            space = self.tree.box(node)
             shared = {b: intersection(box, space) for b, box in boxes.items()}
             boxes = {b: box for b, box in shared.items() if box is not None}
         rows = seen_by.may_show(list(boxes.values())).tolist()
@@ -167,21 +167,21 @@ class Painter:
         """Which Gaussians some view may see inside a box, [n]."""
         return reaches(means, scales, box, self._optics.slack(means), self._optics.slant)
 
-    def paint(
+    def render(
         self,
-        unit: int,
+        node: int,
         loaded: Loaded,
         seen: Sequence[Seen],
-        settings: PaintSettings,
+        settings: RenderSettings,
         *,
         active: int | None = None,
     ) -> Iterator[FrozenLayers | None]:
-        """Draw a unit, loaded by `load`, for each of these views: cut by the window of the active block (by
+        """Draw a node, loaded by `load`, for each of these views: cut by the window of the active block (by
         fragments) or put whole before or behind the active block (by means). Without an active block all
         is in front. None where the view sees nothing of it."""
         shows = [loaded.shows_in(one.view) for one in seen]
         shots = [
-            self._cut_shot(unit, one)
+            self._cut_shot(node, one)
             for one, shown in zip(seen, shows, strict=True)
             if shown and one.window is not None
         ]
@@ -190,52 +190,52 @@ class Painter:
             if not shown:
                 yield None
             elif one.window is None:
-                yield self._paint_whole(unit, loaded.gaussians, one, settings, active)
+                yield self._render_whole(node, loaded.gaussians, one, settings, active)
             else:
                 cut = next(cuts)
-                # What reaches in from another unit is inside that one's.
+                # What reaches in from another node is inside that one's.
                 others = loaded.own < len(loaded.gaussians)
-                own = cut.inside[torch.where(cut.members < loaded.own)[0]] if others else cut.inside
+                own = cut.inside[torch.where(cut.kept_ids < loaded.own)[0]] if others else cut.inside
                 yield FrozenLayers(cut.front, cut.back, own)
 
-    def _cut_shot(self, unit: int, seen: Seen) -> CutShot:
-        span, window = self.span(unit, seen.view, seen.crop), seen.window
+    def _cut_shot(self, node: int, seen: Seen) -> CutShot:
+        span, window = self.span(node, seen.view, seen.crop), seen.window
         return CutShot(seen.view, seen.crop, span.before(window), window, span.behind(window))
 
-    def _paint_whole(
-        self, unit: int, gaussians: Gaussians, seen: Seen, settings: PaintSettings, active: int | None
+    def _render_whole(
+        self, node: int, gaussians: Gaussians, seen: Seen, settings: RenderSettings, active: int | None
     ) -> FrozenLayers:
         by_means = self.ownership == "means"
-        span = None if by_means else self.span(unit, seen.view, seen.crop)
+        span = None if by_means else self.span(node, seen.view, seen.crop)
         with torch.no_grad():
             raster = self.rasterizer(gaussians, seen.view, crop=seen.crop, z_window=span, **vars(settings))
         layer, nothing = raster.layer, self._nothing(seen.view, seen.crop)
         front = active is None or not by_means
-        front = front or self.order((unit, self.tree.node_of(active)), seen.view)[0] == unit
+        front = front or self.order((node, self.tree.node_of(active)), seen.view)[0] == node
         return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
 
-    def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
-        """Where the rays through the crop's tiles are inside a unit."""
+    def span(self, node: int, view: View, crop: Crop) -> ZWindow:
+        """Where the rays through the crop's tiles are inside a node."""
         grid = self.rasterizer.window_grid(crop)
-        if unit == 0:
+        if node == 0:
             return ZWindow.everything(grid, self.device, view.viewmat.dtype)
-        return ray_interval(self.tree.box(unit), view, grid, self.device)
+        return ray_interval(self.tree.box(node), view, grid, self.device)
 
-    def order(self, units: Sequence[int], view: View) -> tuple[int, ...]:
-        """The units front to back, as `view` sees them."""
-        wanted, center = set(units), view.center.double().cpu()
+    def order(self, nodes: Sequence[int], view: View) -> tuple[int, ...]:
+        """The nodes front to back, as `view` sees them."""
+        wanted, center = set(nodes), view.center.double().cpu()
         return tuple(node for node in nodes_in_order(self.tree, center) if node in wanted)
 
-    def fold_up(self, parts: dict[int, FrozenLayers | None], unit: int, view: View) -> None:
-        """Collapse what has come in with `unit` and its neighbours in the tree, in place, as far as it goes.
+    def fold_up(self, parts: dict[int, FrozenLayers | None], node: int, view: View) -> None:
+        """Collapse what has come in with `node` and its neighbours in the tree, in place, as far as it goes.
 
         Whatever lies under a node is a run of the front-to-back order, so it folds by itself. Done after
-        each unit, what is held grows with the depth of the tree and not with the number of units.
+        each node, what is held grows with the depth of the tree and not with the number of nodes.
 
         Args:
             parts: by node; None for one that shows nothing.
         """
-        center, node = view.center.double().cpu(), unit
+        center = view.center.double().cpu()
         while node:
             node = int(self.tree.parent[node])
             near, far = node_children_in_order(self.tree, node, center)
@@ -244,19 +244,19 @@ class Painter:
             parts[node] = _over(parts.pop(near), parts.pop(far))
 
     def fold(self, parts: dict[int, FrozenLayers | None], view: View, crop: Crop) -> FrozenLayers:
-        """What `fold_up` has made of all units: one layer in front of the active block and one behind, and
+        """What `fold_up` has made of all nodes: one layer in front of the active block and one behind, and
         what is inside in one."""
         nothing = self._nothing(view, crop)
         return parts[0] or FrozenLayers(nothing, nothing)
 
-    def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
-        """The whole scene through layers, unit by unit: the composited render."""
+    def picture(self, view: View, settings: RenderSettings, crop: Crop | None = None) -> Layer:
+        """The whole scene through layers, node by node: the composited render."""
         crop = crop or view.full
         parts: dict[int, FrozenLayers | None] = {}
-        for unit in self.units():
-            loaded = self.load(unit, seen_by=self.frusta([(view, crop)]))
-            (parts[unit],) = self.paint(unit, loaded, [Seen(view, crop)], settings)
-            self.fold_up(parts, unit, view)
+        for node in self.nodes():
+            loaded = self.load(node, seen_by=self.frusta([(view, crop)]))
+            (parts[node],) = self.render(node, loaded, [Seen(view, crop)], settings)
+            self.fold_up(parts, node, view)
         return self.fold(parts, view, crop).front
 
     def _nothing(self, view: View, crop: Crop) -> Layer:
@@ -276,7 +276,7 @@ class Painter:
 
 
 def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:
-    """The parts of two units as one, `front` being the nearer; None shows nothing."""
+    """The parts of two nodes as one, `front` being the nearer; None shows nothing."""
     if front is None or behind is None:
         return behind if front is None else front
     inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]

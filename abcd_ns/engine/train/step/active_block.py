@@ -8,11 +8,11 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
-from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
+from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
-from abcd_ns.engine.train.density.shedding import LAST, faded
+from abcd_ns.engine.train.density.pruning import LAST, faded
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
@@ -21,7 +21,7 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import Gaussians
 
 
-class LiveBlock:
+class ActiveBlock:
     """What is live in a run's parameters, with what density control has gathered of it."""
 
     def __init__(self, run: TrainingRun) -> None:
@@ -54,11 +54,11 @@ class LiveBlock:
         if active.done == 0 and not (active.saved or active.is_whole or active.is_joint):
             self._lower_degrees()
         if active.done == 0 and not active.saved and self.clocks.visits == 0:
-            run.health.hold_back_giants(run.views.values())
+            run.health.shrink_oversized(run.views.values())
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
-        if GONE in self.growth:  # what was mended may have them again
+        if GONE in self.growth:  # what was repaired may have them again
             rest = self._run.params["features_rest"]
             rest.data.masked_fill_(are_gone(self.growth[GONE], rest), 0.0)
         return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
@@ -95,13 +95,13 @@ class LiveBlock:
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, judged, clock)
         if run.density.refines(clock, self.growth):
             self.clocks = replace(self.clocks, refined=clock.steps)
-            self.hold_back_giants()
+            self.shrink_oversized()
 
     def judge(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
         change too little. What is seen from now on soon counts for more."""
         run, before = self._run, len(self)
-        self.growth = run.density.shed(run.params, run.optimizers, self.growth, run.share)
+        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share)
         run.health.count("shed", before - len(self))
         self._lower_degrees()
         self.growth = faded(self.growth)
@@ -109,7 +109,7 @@ class LiveBlock:
     def _lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
         run = self._run
-        if run.density.weighs and run.share >= START:
+        if run.density.wants_weights and run.share >= START:
             views = [run.views[view] for view in run.active.trained_on]
             self.growth = lower(run.params, run.optimizers, self.growth, views)
 
@@ -152,8 +152,8 @@ class LiveBlock:
         grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
         return grown and is_full(len(self), 1, self._run.config.limits)
 
-    def hold_back_giants(self) -> None:
+    def shrink_oversized(self) -> None:
         """Shrink what is too large for every camera, while there is time to make good what is missed: a plain
         background may be nothing but oversized Gaussians."""
         if self._run.share < LAST:
-            self._run.health.hold_back_giants(self._run.views.values())
+            self._run.health.shrink_oversized(self._run.views.values())

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.survey import CROP_MARGIN, extent_of_most, survey
+from abcd_ns.engine.layers.footprints import CROP_MARGIN, extent_of_most, footprints
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.types import Gaussians
 from tests.engine.space.test_tree import SEEDS
@@ -48,7 +48,7 @@ def cluster_and_veil(opacity: float) -> Gaussians:
 def test_a_faint_and_wide_one_does_not_make_the_crop_the_image():
     views = ring_of_views(3, width=320, height=240)
     block = cluster_and_veil(opacity=0.005)
-    whole, most = (survey(block, 0, views, DRAW, share).crops for share in (1.0, 0.9))
+    whole, most = (footprints(block, 0, views, DRAW, share).crops for share in (1.0, 0.9))
     for view in views:
         shown = 1 - DRAW(block, view, sh_degree=0).transmittance
         held = float(shown[most[view.index].slices].sum())
@@ -62,7 +62,7 @@ def test_what_no_small_picture_shows_keeps_all_that_it_may_touch():
     views = ring_of_views(2, width=160, height=120)
     block = random_gaussians(5, size=0.2)
     faint = replace(block, opacities=torch.full_like(block.opacities, -30.0))
-    assert survey(faint, 0, views, DRAW, 0.995) == survey(faint, 0, views, DRAW)
+    assert footprints(faint, 0, views, DRAW, 0.995) == footprints(faint, 0, views, DRAW)
 
 
 def test_crops_have_room_for_the_windows_of_ssim():
@@ -71,7 +71,7 @@ def test_crops_have_room_for_the_windows_of_ssim():
     block.means[:] *= 0.1
     shown = (1 - DRAW(block, view, sh_degree=0).transmittance) > 1e-3
     rows, columns = torch.where(shown)
-    crop = survey(block, 0, [view], DRAW, 0.999).crops[view.index]
+    crop = footprints(block, 0, [view], DRAW, 0.999).crops[view.index]
     ends = (
         (crop.x, crop.x + crop.width, view.width, columns),
         (crop.y, crop.y + crop.height, view.height, rows),

@@ -1,9 +1,9 @@
-"""What a sweep visits and how: ahead, at first, at the end; and the paper's choices, each an option."""
+"""What an epoch visits and how: ahead, at first, at the end; and the paper's choices, each an option."""
 
 import pytest
 import torch
 
-from abcd_ns.engine.events import PhotosWanted, SweepEnded, VisitBegan
+from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -15,9 +15,9 @@ from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, listen, stop
 
 
-def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(make, photos):
+def test_who_is_hidden_is_no_part_of_an_epoch_until_looked_at_again(make, photos):
     coordinator = make(blocks=4, steps=10_000, density=STILL)
-    ended, began = listen(coordinator, SweepEnded), listen(coordinator, VisitBegan)
+    ended, began = listen(coordinator, EpochEnded), listen(coordinator, VisitBegan)
     while not ended:
         train(coordinator, photos, steps=1)
     for block in range(4):
@@ -53,7 +53,7 @@ def test_photos_of_a_step_and_of_those_to_come_are_wanted(make, blocks):
 
 
 def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(make, monkeypatch):
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.YOUNG", 20)  # these see a few dozen
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.UNDER_TRAINED", 20)  # these see a few dozen
     options = {"blocks": 3, "steps": 150, "fast_start": True, "density": STILL}
     coordinator, drawn, expected, stops = make(**options), set(), 0, 0
     while not coordinator.finished:
@@ -90,7 +90,7 @@ def test_a_queue_of_before_visits_knew_their_batch_is_read():
 
 
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photos, monkeypatch):
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.SETTLING_VIEWS", 1)  # these see a few dozen
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.DECAY_VIEWS", 1)  # these see a few dozen
     coordinator = make(blocks=7, steps=55, density=STILL, visit_steps=5, fast_start=True)
     began, rates = listen(coordinator, VisitBegan), dict[int, set[float]]()
     while not coordinator.finished:
@@ -98,7 +98,7 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photo
         rates.setdefault(began[-1].visit, set()).add(coordinator.optimizers["quats"].param_groups[0]["lr"])
     first, second = [rates[visit.visit] for visit in began[:7]], [rates[visit.visit] for visit in began[7:]]
     assert sorted(visit.block for visit in began[:7]) == list(range(7))
-    # As large as they ever are, though the first sweep goes on when three fifths of the run are done.
+    # As large as they ever are, though the first epoch goes on when three fifths of the run are done.
     (whole,) = set.union(*first)
     assert max(set.union(*second)) < whole
     assert min(second[-1]) < 0.2 * whole
@@ -106,7 +106,7 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photo
 
 def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make, photos):
     density = DensityConfig(refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, price=0)
-    coordinator = make(blocks=2, steps=60, scaffold=40, visit_steps=8, density=density)
+    coordinator = make(blocks=2, steps=60, coarse_model=40, visit_steps=8, density=density)
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:
         train_step(coordinator, photos)

@@ -8,13 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.events import Mended
+from abcd_ns.engine.events import Repaired
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, nothing_live
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, haze, risen, weigh
+from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, faded, floaters, risen
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
@@ -42,7 +42,7 @@ def some_hidden() -> Gaussians:
     looks=st.integers(0, 200),
 )
 def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weight, views, price, looks):
-    found = (fills(statistics(weight, [looks / views] * len(weight))) <= price).tolist()
+    found = (contributions(statistics(weight, [looks / views] * len(weight))) <= price).tolist()
     for value, goes in zip(weight, found, strict=True):
         per_view = value / max(looks, 1)
         if abs(per_view * views - price) > 1e-3:
@@ -59,12 +59,12 @@ def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, 
         (weight, looks) = (20.0 * passes, passes * views)
         drawn = {"weights": torch.zeros(1, 1, requires_grad=True)}
         drawn["weights"].grad = torch.full((1, 1), weight / looks)
-        one = weigh([drawn], views)
+        one = blend_sums([drawn], views)
         total += looks * torch.cat((one["weight"], one["passes"]))
     growth = {"weight": total[:1], "passes": total[1:]}
-    torch.testing.assert_close(fills(growth), torch.tensor([20.0]), rtol=1e-4, atol=0.0)
-    assert bool(fills(growth) <= 20.1)
-    assert not bool(fills(growth) <= 19.9)
+    torch.testing.assert_close(contributions(growth), torch.tensor([20.0]), rtol=1e-4, atol=0.0)
+    assert bool(contributions(growth) <= 20.1)
+    assert not bool(contributions(growth) <= 19.9)
 
 
 @given(
@@ -75,13 +75,13 @@ def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, 
     ),
     st.floats(0, 0.1),
 )
-def test_haze_is_faint_and_fills_more_than_the_mean_of_those_known(several, faint):
+def test_a_floater_is_faint_and_fills_more_than_the_mean_of_those_known(several, faint):
     weight, opacities, known = (list(values) for values in zip(*several, strict=True))
     growth = statistics(weight, [1.0 if each else 0.5 for each in known])
     told = [px for px, each in zip(weight, known, strict=True) if each]
     mean = sum(told) / max(len(told), 1)
     bound = min(faint, 0.25 * sorted(opacities)[(len(opacities) - 1) // 2])
-    found = haze(growth, torch.tensor(opacities), faint).tolist()
+    found = floaters(growth, torch.tensor(opacities), faint).tolist()
     for px, opacity, each, goes in zip(weight, opacities, known, found, strict=True):
         if abs(px - mean) > 1e-3 and abs(opacity - bound) > 1e-6:
             assert goes == (each and px > mean and opacity < bound)
@@ -103,14 +103,14 @@ def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(
 
 
 def test_drawings_without_weights_say_nothing():
-    assert weigh([{"means2d": torch.zeros(1, 3, 2)}], 5) == {}
+    assert blend_sums([{"means2d": torch.zeros(1, 3, 2)}], 5) == {}
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, blocks):
     density = replace(STILL, price=1.0)
     coordinator = make(start=some_hidden(), blocks=blocks, steps=80, density=density, batch=1)
-    told = listen(coordinator, Mended)
+    told = listen(coordinator, Repaired)
     train(coordinator, photos)
     left = whole_scene(coordinator)
     gone = 120 - len(left)
@@ -118,11 +118,13 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, 
     assert sum(record.shed for record in coordinator.state.health.values()) == gone
     assert HIDDEN / 2 < gone < 2 * HIDDEN
     assert float(left.means[:, 2].max()) < 40
-    fills = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(dim=0)
-    assert float((fills > 0.5).float().mean()) > 0.9
+    contributions = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(
+        dim=0
+    )
+    assert float((contributions > 0.5).float().mean()) > 0.9
 
 
-def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(make, photos):
+def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_prunes(make, photos):
     start = random_gaussians(60, seed=7, size=0.12)
     faint = torch.arange(60) % 3 == 0
     start = replace(start, opacities=torch.where(faint[:, None], -6.0, 1.0))  # a sigmoid of 1/404
@@ -134,13 +136,13 @@ def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(make, p
 
 
 @pytest.mark.parametrize(("progress", "gone"), [(0.6, [0, 1]), (0.25, [0]), (0.8, [])])
-def test_a_cloud_before_cameras_is_shed_and_what_is_as_faint_but_small_stays(progress, gone):
-    opacity, fills = [0.02, 0.07, 0.02, 0.07, *[0.9] * 5], [90.0, 90.0, 9.0, 9.0, 90.0, *[9.0] * 4]
+def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(progress, gone):
+    opacity, contributions = [0.02, 0.07, 0.02, 0.07, *[0.9] * 5], [90.0, 90.0, 9.0, 9.0, 90.0, *[9.0] * 4]
     gaussians = replace(random_gaussians(9), opacities=torch.tensor(opacity).logit()[:, None])
     params, optimizers = nothing_live(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
-    growth = {**statistics(fills, [1.0] * 9), "count": torch.ones(9)}
-    DensityControl(DensityConfig(price=1.0)).shed(params, optimizers, growth, progress)
+    growth = {**statistics(contributions, [1.0] * 9), "count": torch.ones(9)}
+    DensityControl(DensityConfig(price=1.0)).prune(params, optimizers, growth, progress)
     left = [each for each in range(9) if each not in gone]
     assert params["means"].tolist() == gaussians.means[left].tolist()
 
@@ -159,7 +161,7 @@ def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     (sample,) = batch.samples
     rendered = coordinator.render(batch)
     coordinator.loss(batch, rendered.pictures, [photos(sample.view.index, sample.crop)]).backward()
-    found = weigh(rendered.infos, len(views))["weight"]
+    found = blend_sums(rendered.infos, len(views))["weight"]
     owner = torch.cat([torch.full((coordinator.scene.count(b),), b) for b in range(2)])
     shot = replace(sample.shot, frozen=None, z_window=None)
     expected = weights(before, coordinator.run.rasterizer, [shot])[0, owner == block]
@@ -167,7 +169,7 @@ def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)
 
 
-def test_one_block_sheds_after_every_so_many_passes(make, views, photos):
+def test_one_block_prunes_after_every_so_many_passes(make, views, photos):
     first, counts = PASSES * len(views), []
     density = replace(STILL, price=1e-9)
     coordinator = make(start=some_hidden(), blocks=1, steps=3 * first, density=density, batch=1)

@@ -34,7 +34,7 @@ class VisitGeometry:
         return tuple(sorted(self.crops))
 
 
-def survey(
+def footprints(
     gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer, share: float = 1.0
 ) -> VisitGeometry:
     """Which views see the block's Gaussians, and where in the image.

@@ -9,8 +9,8 @@ import torch
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import Clocks
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scaffold import BEGINS, REVEALED_OPACITY, blocks_at_rest
-from abcd_ns.engine.store.special_blocks import RESERVE, in_order
+from abcd_ns.engine.store.coarse_model import BEGINS, REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.store.special_blocks import DEFERRED, in_order
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
@@ -27,14 +27,14 @@ def warm_up_is_not_prolonged(monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 1)
 
 
-def test_without_a_scaffold_nothing_waits(start):
+def test_without_a_coarse_model_nothing_waits(start):
     tree = build_kd(start.means, 4)
     assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
-    assert in_order(blocks_at_rest(tree, start, room=30)) == [0, 1, 2, 3, RESERVE]
+    assert in_order(blocks_at_rest(tree, start, room=30)) == [0, 1, 2, 3, DEFERRED]
 
 
-def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(make, photos, start):
-    coordinator = make(blocks=4, steps=40, scaffold=1000, warmup=0.25, density=STILL)
+def test_where_all_fit_all_are_the_coarse_model_and_nobody_waits(make, photos, start):
+    coordinator = make(blocks=4, steps=40, coarse_model=1000, warmup=0.25, density=STILL)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
     assert len(coordinator.params["means"]) == len(start)
@@ -46,8 +46,8 @@ def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(make, photos, start
     assert coordinator.finished
 
 
-def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(make, views, photos):
-    coordinator = make(blocks=4, steps=40, scaffold=30)
+def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, photos):
+    coordinator = make(blocks=4, steps=40, coarse_model=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
     begins = math.ceil(BEGINS * 30)
@@ -58,18 +58,18 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(make, views, photos
 
 
 def test_when_it_ends_everyone_is_in_their_block_once(make, photos):
-    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL)
+    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.25, density=STILL)
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos, steps=10)
     assert coordinator.state.active is None
     scene = coordinator.scene
-    assert scene.rows(RESERVE) == 0
+    assert scene.rows(DEFERRED) == 0
     for block in range(4):
         state = scene.state(block)
         assert bool((scene.tree.assign(state.gaussians.means) == block).all())
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
-        assert bool(state.waits.any())
-        assert not bool((state.waits & trained).any())
+        assert bool(state.deferred.any())
+        assert not bool((state.deferred & trained).any())
         assert state.clocks == Clocks(steps=10, adam_views=10)
     assert coordinator.count() == 120
     while not coordinator.finished:
@@ -80,7 +80,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(make, photos):
 
 
 def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, photos):
-    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL, heal=False)
+    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.25, density=STILL, heal=False)
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
     assert len(whole_scene(coordinator)) == math.ceil(BEGINS * 30)
@@ -106,12 +106,12 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
 
 def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
     """Within the warm-up, at its end, and after it."""
-    assert_resumes(make, photos, 4, 10, 13, blocks=4, steps=24, scaffold=30, warmup=0.4)
+    assert_resumes(make, photos, 4, 10, 13, blocks=4, steps=24, coarse_model=30, warmup=0.4)
 
 
 def test_density_controls_clock_is_the_runs(make, photos, monkeypatch):
     """It does not start anew when the warm-up is over, which grows as well."""
-    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL)
+    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.5, density=STILL)
     found = []
 
     def watch(_control, _params, _optimizers, growth, _infos, _judged, clock):
@@ -124,9 +124,9 @@ def test_density_controls_clock_is_the_runs(make, photos, monkeypatch):
 
 
 @pytest.mark.parametrize("most", [0, 125, 400])
-def test_the_scaffold_grows_while_there_is_room_for_it(make, photos, start, most):
+def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
-    coordinator = make(**LONG, scaffold=len(start), scaffold_gaussians=most, density=GROWING)
+    coordinator = make(**LONG, coarse_model=len(start), scaffold_gaussians=most, density=GROWING)
     train(coordinator, photos, steps=29)
     live = len(coordinator.params["means"])
     assert live == coordinator.count()
@@ -139,13 +139,13 @@ def test_the_scaffold_grows_while_there_is_room_for_it(make, photos, start, most
 
 def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
     density = replace(GROWING, max_gaussians=len(start))
-    coordinator = make(**LONG, scaffold=60, scaffold_gaussians=100, density=density)
+    coordinator = make(**LONG, coarse_model=60, scaffold_gaussians=100, density=density)
     train(coordinator, photos, steps=29)
     assert len(coordinator.params["means"]) <= 60
 
 
 @pytest.mark.parametrize(
-    ("scaffold", "warmup", "longer", "passes", "expected"),
+    ("coarse_model", "warmup", "longer", "passes", "expected"),
     [
         (30, 0.5, 1, 1, 5),
         (30, 0.5, 1, 2, 10),
@@ -156,13 +156,13 @@ def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
     ],
 )
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
-    make, photos, monkeypatch, scaffold, warmup, longer, passes, expected
+    make, photos, monkeypatch, coarse_model, warmup, longer, passes, expected
 ):
     """Where it has no room for all: then, and not only when its share of the run is over. Where it has, after
     twice its share at most, and not before its share is over."""
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.SCAFFOLD_PASSES", passes)
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.COARSE_MODEL_PASSES", passes)
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", longer)
-    coordinator = make(blocks=4, steps=50, scaffold=scaffold, warmup=warmup, density=STILL)
+    coordinator = make(blocks=4, steps=50, coarse_model=coarse_model, warmup=warmup, density=STILL)
     ended = listen(coordinator, VisitEnded)
     while not ended:
         train_step(coordinator, photos)
