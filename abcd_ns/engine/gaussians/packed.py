@@ -15,8 +15,7 @@ from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use, up_to_d
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 IS_DEFERRED, DEGREES = "waits", "degrees"
-"""Columns: deferred Gaussians; the highest degree in use of each Gaussian's harmonics, which its moments
-share."""
+"""Columns: which Gaussians are deferred; the highest degree in use of each one's harmonics, and moments."""
 DRAWN = (*PARAM_NAMES, IS_DEFERRED, DEGREES)
 """What is needed of a block to draw it."""
 

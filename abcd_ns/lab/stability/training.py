@@ -1,5 +1,4 @@
-"""A3, A5 to A7, A13, A14, A19, A23: oversized Gaussians, growth, old layers, seams, the number of blocks,
-fog."""
+"""A3, A5 to A7, A13, A14, A19, A23: oversized Gaussians, growth, old layers, seams, blocks, fog."""
 
 import math
 from dataclasses import replace
