@@ -1,7 +1,5 @@
 """Pixels as small square tiles: the layout in which the torch rasterizer computes."""
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -82,14 +80,6 @@ class TileGrid:
         rows, cols = (torch.div(x, self.side, rounding_mode="floor") for x in (rows, cols))
         return (rows - self.first_row) * self.cols + cols - self.first_col
 
-    def origins(
-        self, tiles: Int[Tensor, "a"], dtype: torch.dtype
-    ) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
-        """(x, y) of the tiles' upper left corners, in pixels of the full image."""
-        x = (self.first_col + tiles % self.cols) * self.side
-        y = (self.first_row + tiles // self.cols) * self.side
-        return x.to(dtype), y.to(dtype)
-
     def to_tiles(self, image: Float[Tensor, "c h w"], fill: float = 0.0) -> Float[Tensor, "c p t"]:
         """[channel, pixel in tile, tile] from an image of the crop; `fill` where tiles stick out of it."""
         left, top = self.crop.x - self.first_col * self.side, self.crop.y - self.first_row * self.side
@@ -105,64 +95,3 @@ class TileGrid:
         padded = blocks.reshape(tiled.shape[0], self.rows * self.side, self.cols * self.side)
         top, left = self.crop.y - self.first_row * self.side, self.crop.x - self.first_col * self.side
         return padded[:, top : top + self.crop.height, left : left + self.crop.width]
-
-
-@dataclass(frozen=True)
-class TileSheet:
-    """The tiles of several crops, each of its own view, numbered one grid after the other."""
-
-    grids: tuple[TileGrid, ...]
-
-    @property
-    def side(self) -> int:
-        return self.grids[0].side
-
-    @property
-    def pixels_per_tile(self) -> int:
-        return self.grids[0].pixels_per_tile
-
-    @property
-    def tiles(self) -> int:
-        """How many in all."""
-        return sum(self._sizes)
-
-    @property
-    def _sizes(self) -> list[int]:
-        return [grid.tiles for grid in self.grids]
-
-    def numbers(self, like: Tensor) -> Float[Tensor, "5 g"]:
-        """Of each grid what splat_kernels.tile_rows takes."""
-        crops = [grid.crop for grid in self.grids]
-        columns = [(crop.x, crop.y, crop.width, crop.height, self.side) for crop in crops]
-        return like.new_tensor(columns).T.contiguous()
-
-    @property
-    def starts(self) -> list[int]:
-        """The number of each grid's first tile, and one past the last grid's last."""
-        return list(itertools.accumulate(self._sizes, initial=0))
-
-    def places(self, device: torch.device) -> Int[Tensor, "2 g"]:
-        """Of each grid (a, c): the tile in row r and column q of the image has the number a + c r + q."""
-        places = [
-            (start - grid.first_row * grid.cols - grid.first_col, grid.cols)
-            for start, grid in zip(self.starts, self.grids, strict=False)
-        ]
-        return torch.tensor(places, device=device).T.contiguous()
-
-    def origins(self, like: Tensor) -> Float[Tensor, "2 t"]:
-        """(x, y) of all tiles' upper left corners, in pixels of their full image."""
-        numbers = [torch.arange(size, device=like.device) for size in self._sizes]
-        pairs = (grid.origins(n, like.dtype) for grid, n in zip(self.grids, numbers, strict=True))
-        return torch.cat([torch.stack(pair) for pair in pairs], dim=1)
-
-    def to_tiles(
-        self, images: Sequence[Float[Tensor, "c _h _w"]], fill: float = 0.0
-    ) -> Float[Tensor, "c p t"]:
-        """[channel, pixel in tile, tile] from an image of each crop; `fill` where tiles stick out of it."""
-        parts = [grid.to_tiles(image, fill) for grid, image in zip(self.grids, images, strict=True)]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=2)
-
-    def to_images(self, tiled: Float[Tensor, "c p t"]) -> list[Tensor]:
-        """The inverse of `to_tiles`: [channel, h, w] of each crop."""
-        parts = tiled.split(self._sizes, dim=2)
-        return [grid.to_image(part) for grid, part in zip(self.grids, parts, strict=True)]
