@@ -80,6 +80,14 @@ class TileGrid:
         rows, cols = (torch.div(x, self.side, rounding_mode="floor") for x in (rows, cols))
         return (rows - self.first_row) * self.cols + cols - self.first_col
 
+    def origins(
+        self, tiles: Int[Tensor, "a"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
+        """(x, y) of the tiles' upper left corners, in pixels of the full image."""
+        x = (self.first_col + tiles % self.cols) * self.side
+        y = (self.first_row + tiles // self.cols) * self.side
+        return x.to(dtype), y.to(dtype)
+
     def to_tiles(self, image: Float[Tensor, "c h w"], fill: float = 0.0) -> Float[Tensor, "c p t"]:
         """[channel, pixel in tile, tile] from an image of the crop; `fill` where tiles stick out of it."""
         left, top = self.crop.x - self.first_col * self.side, self.crop.y - self.first_row * self.side

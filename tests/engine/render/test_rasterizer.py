@@ -202,7 +202,7 @@ def test_what_cannot_be_seen_leaves_nothing_and_no_gradient_breaks():
         assert not value.grad[:5].any(), name
 
 
-def test_needle_and_oversized_gaussian_gaussians_have_finite_gradients_in_float32():
+def test_needles_and_oversized_gaussians_have_finite_gradients_in_float32():
     gaussians = random_gaussians(8, dtype=torch.float32)
     scales = torch.tensor([[-12.0, -12, 3], [6, 6, 6], [-20, -20, -20], [3, -9, -9]]).repeat(2, 1)
     view = small_view(dtype=torch.float32)
