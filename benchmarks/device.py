@@ -83,7 +83,7 @@ class Watch:
 
     @contextmanager
     def watching(self, coordinator: Coordinator) -> Iterator[None]:
-        """Count layers, visits' ends and refinements, whoever calls them."""
+        """Count layers, visits' ends and refinements, whatever calls them."""
         layers = {name: self.noting(getattr(LayerStore, name), self.layers) for name in ("put", "get")}
         ends = {n: self.noting(getattr(coordinator, n), self.edges) for n in ("begin_visit", "end_visit")}
         refine = DensityControl._step_default

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.run import STATE
 
 LEVELS = 3
 """A run is that many folders below the outputs: SCENE/METHOD/TIME."""

@@ -27,7 +27,7 @@ class WorkersError(UserError):
 
 @dataclass(frozen=True)
 class VisitTask:
-    """All that decides what a visit makes of its block, besides Gaussians: whoever trains it, and however
+    """All that decides what a visit makes of its block, besides Gaussians: whatever trains it, and however
     often, comes to the same."""
 
     active: ActiveVisit

@@ -126,7 +126,7 @@ class ForkedWorkers(Workers[Place]):
         if self._held_since is None:
             return
         held, self._held_since = time.perf_counter() - self._held_since, None
-        self._stood_still.value += held  # first: whoever goes on may read the clock at once
+        self._stood_still.value += held  # first: the next worker may read the clock at once
         for member in self._members:
             member.heard += held  # nobody was silent: they could not speak
         self._signal(signal.SIGCONT)

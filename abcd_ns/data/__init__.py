@@ -3,5 +3,7 @@
 `prepare` reads a whole capture, `scene` is what comes of it, `photos` decodes, the others know file formats.
 """
 
-DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+OPTION = "--pipeline.datamanager.dataparser."
+"""Begins the options of the reader of data."""
+DOWNSCALE = f"{OPTION}downscale-factor"
 """The option by which photos are reduced."""

@@ -16,7 +16,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from abcd_ns.data.input_errors import OPTION, InputError, Problems
+from abcd_ns.data import OPTION
+from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
 from abcd_ns.data.picture_files import FileFinder, check_complete, read_header
 from abcd_ns.data.scene import Lens, check_lens

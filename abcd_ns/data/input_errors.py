@@ -8,8 +8,6 @@ from rich.markup import escape
 
 from abcd_ns.errors import UserError
 
-OPTION = "--pipeline.datamanager.dataparser."
-"""How the options of this reader begin."""
 SHOWN = 20
 """Lines of one error that are shown; the others are counted."""
 FEW = 3

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses, rotation_matrix_between
 
-from abcd_ns.data.input_errors import OPTION, InputError
+from abcd_ns.data import OPTION
+from abcd_ns.data.input_errors import InputError
 
 Orientation = Literal["pca", "up", "vertical", "none"]
 _LEAST_UP = 0.1

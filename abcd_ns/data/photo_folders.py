@@ -4,7 +4,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from abcd_ns.data.input_errors import OPTION, InputError, Problems
+from abcd_ns.data import OPTION
+from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import (
     SUFFIXES,

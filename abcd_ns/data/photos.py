@@ -25,7 +25,7 @@ from abcd_ns.data.undistort import Undistortion
 READERS = 4
 """Threads that decode what is expected."""
 FEWEST_AHEAD = 12
-"""Photos that are read ahead of whoever asks for them, beyond the budget: a step's, and those of the next."""
+"""Photos that are read ahead of requests, beyond the budget: a step's, and those of the next."""
 _MASK_USED = 255
 _LOSSY = ("JPEG", "MPO", "WEBP")
 _Key = tuple[Literal["image", "mask"], int]
@@ -95,8 +95,8 @@ class Photos:
         return self._get(("image", index))
 
     def expect(self, indices: Iterable[int]) -> None:
-        """Begin to decode the first of these photos and their masks, if they are not kept, for whoever asks
-        next: as many as take an eighth of the budget, and a few in any case."""
+        """Begin to decode the first of these photos and their masks, if they are not kept, for the next
+        requests: as many as take an eighth of the budget, and a few in any case."""
         for index in islice(indices, self._ahead):
             self._expect(("image", index))
             if self.sources[index].mask_path is not None:

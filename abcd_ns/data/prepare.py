@@ -11,9 +11,9 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
-from abcd_ns.data import DOWNSCALE
+from abcd_ns.data import DOWNSCALE, OPTION
 from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_models, read_colmap
-from abcd_ns.data.input_errors import OPTION, InputError, Problems
+from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import as_stored, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from abcd_ns.data.input_errors import OPTION, InputError, Problems
+from abcd_ns.data import OPTION
+from abcd_ns.data.input_errors import InputError, Problems
 
 SPLITS = ("train", "val", "test")
 _NAMED = 3

@@ -155,7 +155,7 @@ class PrunedAtEnd:
 
 @dataclass(frozen=True)
 class HeldOutScored:
-    """Whoever runs the training has looked at views that are not trained on; means over them."""
+    """The caller has looked at views that are not trained on; means over them."""
 
     psnr: float
     """dB."""

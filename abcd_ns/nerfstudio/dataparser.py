@@ -18,8 +18,9 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from abcd_ns.data import OPTION
 from abcd_ns.data.dataset import PHOTOS, pinhole_cameras
-from abcd_ns.data.input_errors import OPTION, InputError, one_line
+from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 from abcd_ns.nerfstudio.flags import shown
 

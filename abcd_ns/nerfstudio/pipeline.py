@@ -26,12 +26,12 @@ from abcd_ns.nerfstudio.inspection import factor_of, where_data_is
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import mirror
-from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import RunRequest
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import ray_workers
+from abcd_ns.run import STORE
 from abcd_ns.run.begin import Capture, RunBuilder, gaussians_of_cloud
 from abcd_ns.run.fit import RamShares
 from abcd_ns.run.options import RunOptions

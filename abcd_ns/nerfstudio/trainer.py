@@ -27,11 +27,11 @@ from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_c
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
-from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume
+from abcd_ns.run import STATE, STORE
 from abcd_ns.run.fit import Demand, device_budget, find_fit
 from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
@@ -254,7 +254,7 @@ class AbcdTrainer(Trainer):
             self.pipeline.coordinator.dismiss()
 
     def _save_at_stop(self) -> None:
-        """Save at once, as whoever stops the run may not wait for long; then again, with visits under way."""
+        """Save at once, since a stopped run may not get long; then again, with visits under way."""
         coordinator = self.pipeline.coordinator
         coordinator.save()
         if coordinator.state.in_flight:
@@ -305,7 +305,7 @@ class AbcdTrainer(Trainer):
     def _log_how_to_resume(self) -> None:
         command = command_to_resume(sys.argv, self.config.method_name, self.checkpoint_dir)
         if command is None or not has_begun(self.base_dir / STATE / STORE):
-            return  # whoever started this training knows better, or there is nothing to go on from yet
+            return  # the caller knows better, or there is nothing to go on from yet
         self._say(f"To go on:\n  {command}")
 
     def _say_what_is_next(self) -> None:

@@ -8,7 +8,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
-from abcd_ns.engine.space.near_plane import as_trained
+from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.types import View
 
 

@@ -16,7 +16,7 @@ from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.render import PrimitiveName, make_rasterizer
 from abcd_ns.engine.render.rasterization import rasterizer_on
-from abcd_ns.engine.space.near_plane import as_trained
+from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.store.manifest import manifest_path
 from abcd_ns.engine.train import training_loop
 from abcd_ns.engine.train.run_state import Budget

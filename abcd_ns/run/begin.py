@@ -211,7 +211,7 @@ class RunBuilder:
         return kept
 
     def _fit(self, gaussians: int, blocks: int = 1) -> Fit:
-        """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
+        """How many blocks for a scene that resumes with so many Gaussians in so many blocks."""
         training, capture = self._training, self.capture
         most, factor = training.density.limit, capture.factor
         demand = Demand(capture.pixels, gaussians, training, most, factor, blocks, self._on_cpu)

@@ -20,7 +20,7 @@ ASKED = "blocks asked for"
 
 @dataclass(frozen=True)
 class Start:
-    """What a run goes on from."""
+    """What a run resumes from."""
 
     store: Path
     pin: str | None
@@ -31,7 +31,7 @@ class Start:
 
 @dataclass(frozen=True)
 class MadeFor:
-    """What a store and whoever goes on with it must agree on."""
+    """What a store and a run that resumes from it must agree on."""
 
     photos: str
     """Digest of the training photos' names and sizes. Not of their folder: it may be moved."""

@@ -24,7 +24,7 @@ from abcd_ns.lab.results.records import decode, encode, read_json, write_json
 from abcd_ns.lab.results.results import TERRAIN
 from abcd_ns.lab.runs.runner import run_jobs
 from abcd_ns.machine import describe_machine, describe_versions
-from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.run import STATE
 from abcd_ns.units import MIB
 from benchmarks import visit
 from benchmarks.runs import read_stage

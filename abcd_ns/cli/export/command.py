@@ -21,7 +21,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import Z_TO_Y
 from abcd_ns.formats.packed import BYTES_AT_ONCE
 from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
-from abcd_ns.nerfstudio.run import STATE, STORE
+from abcd_ns.run import STATE, STORE
 
 TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file with the transform from the data's frame to the run's."""

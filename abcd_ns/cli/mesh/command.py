@@ -30,10 +30,10 @@ from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
-from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.progress_bar import ProgressBar
+from abcd_ns.run import STORE
 from abcd_ns.run.fit import FREE_SHARE, RamShares
 from abcd_ns.run.store import MadeFor
 

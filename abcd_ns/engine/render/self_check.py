@@ -103,7 +103,7 @@ def _residual(raster: Raster) -> Float[Tensor, "h w 4"]:
     return torch.arange(4 * height * width).to(raster.depth).sin().view(height, width, 4)
 
 
-@torch.enable_grad()  # whoever evaluates or renders asks for the first picture without
+@torch.enable_grad()  # evaluation and rendering ask for the first picture without
 def values_and_gradients(
     rasterizer: Rasterizer, device: torch.device | str, case: Case, shift: float = 0.0
 ) -> dict[str, Tensor]:

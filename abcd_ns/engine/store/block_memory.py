@@ -17,7 +17,7 @@ class BlockMemory:
 
     @property
     def nbytes(self) -> int:
-        """Of all that is here; added up anew, since whoever reads a block may be broken off anywhere."""
+        """Of all that is here; added up anew, since a read may be broken off anywhere."""
         return sum(block.nbytes for kept in (self._drawn, self._training) for block in kept.values())
 
     def drawn(self, name: BlockName) -> Packed | None:

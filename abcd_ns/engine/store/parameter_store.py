@@ -150,7 +150,7 @@ class ParameterStore:
 
         Args:
             names: of the tensors that are wanted; the rest of the shard is not read once it was checked. None
-                for all, which are checked each time; whoever wants some checks each file once in the life of
+                for all, which are checked each time; of some, each file is checked once in the life of
                 this object.
 
         Raises:

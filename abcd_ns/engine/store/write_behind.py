@@ -54,7 +54,7 @@ class WriteBehind:
     def __init__(self, store: ParameterStore, written: Callable[[Snapshot], None]) -> None:
         self._store, self._written = store, written
         self.mutex = threading.RLock()
-        """Guards all of this; whoever shares data with jobs uses it, too. It must not be held in a fork. The
+        """Guards all of this, and data that callers share with jobs. It must not be held in a fork. The
         viewer's pictures are broken off by an exception in whatever line of Python they are: this lock is let
         go of in none."""
         self.lock = threading.Condition(self.mutex)
@@ -164,7 +164,7 @@ class WriteBehind:
 
 
 def _try(chore: Callable[[], object]) -> None:
-    with suppress(Exception):  # whoever needs what it was for will meet the error
+    with suppress(Exception):  # the caller that needs what it was for meets the error
         chore()
 
 

@@ -17,9 +17,9 @@ class TrainingConfig:
     """How a scene is trained, whatever calls the engine."""
 
     recipe: Recipe = field(default=Recipe())
-    """What makes the method; set by whoever defines one."""
+    """What makes the method; set by the method's definition."""
     limits: Limits = field(default=Limits())
-    """What fits on the device; set by whoever knows its memory."""
+    """What fits on the device; set by the caller, which knows its memory."""
     primitive: PrimitiveName = "3dgs"
     """What a Gaussian is: an ellipsoid (3DGS) or a flat disc, a surfel (2DGS). Part of the scene."""
     sh_degree: int = 3

@@ -140,7 +140,7 @@ class Coordinator(Trainer):
 
     def complete(self) -> None:
         """Take out what the complete run's pictures hardly miss, where options ask for it and there are
-        photos to tell. Whoever goes on from a kill in its midst does it anew, with what is left by then. A
+        photos to tell. A run that resumes from a kill in its midst does it anew, with what is left by then. A
         visit that is under way, as where a run goes on for no more steps, ends."""
         if self.state.active is not None:
             self.end_visit()

@@ -187,7 +187,7 @@ def free_bytes(device: torch.device) -> int:
 
 
 def free_on_gpu(device: torch.device) -> int:
-    """What a GPU has left, whoever uses the rest; torch 2.4 wants to know which, where that goes without
+    """What a GPU has left, whatever uses the rest; torch 2.4 wants to know which, where that goes without
     saying."""
     number = torch.cuda.current_device() if device.index is None else device.index
     return torch.cuda.mem_get_info(number)[0]

@@ -75,7 +75,7 @@ class Trainer(ABC):
         return False
 
     def dismiss(self) -> None:  # noqa: B027 - most have nobody
-        """End whoever trains elsewhere. Harmless when done twice."""
+        """End workers that train elsewhere. Harmless when done twice."""
 
     def pause(self) -> None:
         """From now on no time counts, until the next step; but where others go on training it does."""

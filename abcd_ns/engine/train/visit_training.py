@@ -1,4 +1,4 @@
-"""The training of one visit's block, from its first step to its last: by whoever has the block."""
+"""The training of one visit's block, from its first step to its last: in whichever process has the block."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -77,7 +77,7 @@ class VisitTraining:
         config = self.run.config
         most = views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
         active = self.run.state.active
-        # A run may go on with less memory than its visit began with.
+        # A run may resume with less memory than its visit began with.
         return most if active is None else min(active.batch or most, most)
 
     def attach(self, active: ActiveVisit) -> None:

@@ -29,7 +29,7 @@ from abcd_ns.lab.results.run import Footing, Run
 from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
-from abcd_ns.nerfstudio.run import STORE
+from abcd_ns.run import STORE
 
 WHOLE_STEPS = 12
 """Enough for Adam's moments and the drawing of the largest view to be there."""

@@ -30,8 +30,8 @@ from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel
-from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
+from abcd_ns.run import STORE
 
 
 def run(job: Job, folder: Path) -> Run:
@@ -96,7 +96,7 @@ def set_up(job: Job, out: Path) -> "Training":
 class Training:
     """A trainer that is set up, whose held-out views are scored at the settings' moments of the run.
 
-    The run's stopwatch is paused meanwhile. The end is left to whoever ends the run.
+    The run's stopwatch is paused meanwhile. The end is left to the caller.
     """
 
     def __init__(self, trainer: Trainer, settings: Settings) -> None:

@@ -16,7 +16,7 @@ from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.space.near_plane import as_trained
+from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore

@@ -46,9 +46,9 @@ def with_oversized(start: Gaussians, tree: BlockTree) -> Gaussians:
         rows = (owner == block).nonzero()[:, 0]
         ranked, last = start.means[rows].sort(dim=0).values, len(rows) - 1
         middle = start.means[rows].median(dim=0).values
-        giant = rows[(start.means[rows] - middle).norm(dim=1).argmin()]
+        widest = rows[(start.means[rows] - middle).norm(dim=1).argmin()]
         extent = (ranked[round(0.99 * last)] - ranked[round(0.01 * last)]).max()
-        scales[giant], opacities[giant] = math.log(sigma * float(extent)), 0.0
+        scales[widest], opacities[widest] = math.log(sigma * float(extent)), 0.0
     return replace(start, scales=scales, opacities=opacities)
 
 
@@ -60,11 +60,11 @@ def largest_share(gaussians: Gaussians, views: list[View]) -> float:
 
 @scenario(
     "A3",
-    "needles and giants: half of garden's splats, the worst 3857 frames wide (brush #479)",
+    "needles and oversized Gaussians: half of garden's splats, the worst 3857 frames wide (brush #479)",
     "Gaussians with sigma = 1, 3 and 10 extents of their cell among the first ones",
     "shrunk by a block's refinements, none over 1.25 of what is allowed",
 )
-def giants(lab: Lab) -> Finding:
+def oversized(lab: Lab) -> Finding:
     """A3: three oversized Gaussians at the start; two epochs, so that each block is refined once."""
     stage = make_stage(views=ring(12), points=400)
     tree = build_kd(stage.start().means, BLOCKS)

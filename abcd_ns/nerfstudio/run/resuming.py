@@ -9,8 +9,8 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.manifest import manifest_path, pin_names
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.settings import Plain
+from abcd_ns.run import STATE, STORE
 from abcd_ns.run.store import ASKED, Start
 
 

@@ -1,6 +1,6 @@
 """What a run was trained with, in `abcd/settings.json`: plain values that are read without trusting anyone.
 
-nerfstudio's config.yml names Python objects, which its loader makes: whoever wrote the file decides what is
+nerfstudio's config.yml names Python objects, which its loader makes: its author decides what is
 run. A report about a run from elsewhere must not do that.
 """
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a run ends between two steps, when it is whole, and says how to go on with it."""
+"""Ctrl-C and SIGTERM: a run ends between two steps, when it is whole, and says how to resume it."""
 
 import shlex
 import signal
@@ -40,7 +40,7 @@ def at_once(say: Callable[[], None]) -> Iterator[None]:
 class StopSignals:
     """While entered, turns the first signal into Stopped: at once, or at the end of what must not be cut.
 
-    A second signal acts as it always did, so that whoever does not want to wait need not. In other threads
+    A second signal acts as it always did, so that nobody has to wait. In other threads
     than the main one nothing happens: Python gives signals to that alone.
     """
 
@@ -96,7 +96,7 @@ class StopSignals:
 def command_to_resume(
     argv: Sequence[str], method: str, folder: Path, changed: Mapping[str, object] | None = None
 ) -> str | None:
-    """What to type to go on with the run in `folder`: the same command with --load-dir.
+    """What to type to resume the run in `folder`: the same command with --load-dir.
 
     Args:
         argv: the command line of this process; None is returned if it is not `ns-train`'s.

@@ -13,8 +13,8 @@ from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
 from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions
-from abcd_ns.engine.space.near_plane import as_trained, near_plane
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.space.visibility import footprint, reach_radius, reaches, widest_slant, world_size
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
@@ -150,29 +150,33 @@ def ahead(view, distance, count=1):
     return (view.center + distance * view.viewmat[2, :3]).expand(count, 3)
 
 
+def near_of(views, points):
+    return as_trained(views, points)[0].near
+
+
 def test_half_the_nearest_distance_in_any_view():
     views = ring_of_views(3)
     points = torch.cat((ahead(views[0], 2.0), ahead(views[1], 0.8), ahead(views[2], 2.5)))
-    assert near_plane(points, views) == pytest.approx(0.4, rel=1e-2)
+    assert near_of(views, points) == pytest.approx(0.4, rel=1e-2)
 
 
 def test_what_no_photo_shows_does_not_count():
     (view,) = ring_of_views(1)
     beside = ahead(view, 0.1) + 10 * view.viewmat[0, :3]
     behind = ahead(view, -0.1)
-    assert near_plane(torch.cat((ahead(view, 2.0), beside, behind)), [view]) == pytest.approx(1.0, rel=1e-3)
+    assert near_of([view], torch.cat((ahead(view, 2.0), beside, behind))) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_a_wrong_match_in_thousands_does_not_count():
     (view,) = ring_of_views(1)
     points = torch.cat((ahead(view, 2.0, 5000), ahead(view, 0.05)))
-    assert near_plane(points, [view]) == pytest.approx(1.0, rel=1e-2)
+    assert near_of([view], points) == pytest.approx(1.0, rel=1e-2)
 
 
 def test_gsplats_own_where_nothing_is_known():
     views = ring_of_views(2)
-    assert near_plane(torch.zeros(0, 3), views) == NEAR_PLANE
-    assert near_plane(ahead(views[0], -5.0), views[:1]) == NEAR_PLANE
+    assert near_of(views, torch.zeros(0, 3)) == NEAR_PLANE
+    assert near_of(views[:1], ahead(views[0], -5.0)) == NEAR_PLANE
 
 
 def test_a_camera_far_away_changes_little_for_the_others():
@@ -213,10 +217,10 @@ def test_a_view_that_sees_no_point_reaches_as_far_as_the_others():
     assert as_trained([near], torch.zeros(0, 3))[0].reach == 1.0
 
 
-def test_no_more_points_and_views_than_needed_are_looked_at():
+def test_no_more_points_than_needed_are_looked_at():
     views = ring_of_views(5) * 200
     points = ahead(views[0], 2.0, 50_000)
-    assert near_plane(points, views) == pytest.approx(near_plane(points[:1], views[:5]), rel=1e-3)
+    assert near_of(views, points) == pytest.approx(near_of(views[:5], points[:1]), rel=1e-3)
 
 
 def test_a_gaussian_before_the_camera_spoils_no_picture():

@@ -113,7 +113,7 @@ class Light:
                 continue
             if kept.meta["kind"] != self.kind:
                 raise UserError(
-                    f"The run was begun with --pipeline.training.light {kept.meta['kind']}: go on with that, "
+                    f"The run was begun with --pipeline.training.light {kept.meta['kind']}: take that, "
                     f"not with {self.kind}."
                 )
             for name, value in self._tensors(part).items():

@@ -247,15 +247,15 @@ def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str,
 def _operators_for(device: torch.device) -> Iterator[None]:
     """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call. And
     it gives back the allocator's memory after each refinement, only to ask for it anew: it had better not."""
-    lent: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
+    replaced: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
     if device.type != "cuda":
         from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci  # private: asked of nobody else
 
-        lent.append((gsplat_ops, "compute_relocation", compute_relocation))
-        lent.append((gsplat_ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci))
-    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in lent]
+        replaced.append((gsplat_ops, "compute_relocation", compute_relocation))
+        replaced.append((gsplat_ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci))
+    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
     try:
-        for each in lent:
+        for each in replaced:
             setattr(*each)
         yield
     finally:

@@ -105,7 +105,7 @@ def cut_full(
 
 
 def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
-    """Cut the blocks of a run that goes on with smaller limits than it had; nothing where all are in order.
+    """Cut the blocks of a run that resumes with smaller limits than it had; nothing where all are in order.
 
     A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
     that was the whole scene is over.

@@ -25,7 +25,7 @@ class StepGuard:
         self._told: list[torch.optim.Optimizer] = []
         self._found: Float[Tensor, ""] | None = None
         self.found: list[Float[Tensor, ""]] = []
-        """1 for each round of steps that was skipped, 0 for the others; whoever reads it empties it."""
+        """1 for each round of steps that was skipped, 0 for the others; the reader empties it."""
 
     @property
     def works(self) -> bool:
