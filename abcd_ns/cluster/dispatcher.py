@@ -1,9 +1,9 @@
 """Trains blocks at once: assigns them to workers, and takes in what they made of them in a planned order.
 
 `lag` visits are in flight. They are taken in one after the other, as they would end if all steps took equally
-long, and whenever one is, the next begins from what is there by then. A worker that is done sooner waits. So a
-result depends on `lag`, not on timing or on lost workers: a visit that is done again gives the same. With a lag
-of 1 a run is the same as one by a coordinator alone.
+long, and whenever one is, the next begins from what is there by then. A worker that is done sooner waits. So
+a result depends on `lag`, not on timing or on lost workers: a visit that is done again gives the same. With a
+lag of 1 a run is the same as one by a coordinator alone.
 
 Blocks that are trained at once each make good their share of what is missing (`shared_residual`), in shorter
 visits. What it still costs was measured (docs/cluster.md).
