@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Literal, get_args
 
 Method = Literal[
-    "abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-exact", "abcd-paper", "splatfacto"
+    "abcd-monolithic",
+    "abcd",
+    "abcd-ablated",
+    "abcd-partition",
+    "abcd-exact",
+    "abcd-paper",
+    "splatfacto",
+    "splatfacto-scaled",
 ]
 METHODS: tuple[str, ...] = get_args(Method)
 """In the order in which tables and charts show them."""

@@ -126,6 +126,16 @@ HIDDEN = tuple(
 """Options of splatfacto's model that have no effect, or are set under other names."""
 
 
+NOT_BELOW_0 = (
+    "blocks",
+    "device_budget_gb",
+    "gaussian_bytes",
+    "near_plane",
+    "ram_budget_gb",
+    "datamanager.photo_cache_gb",
+)
+
+
 def check_options(config: TrainerConfig) -> None:
     """Look at a run's options, before its data is.
 
@@ -133,7 +143,7 @@ def check_options(config: TrainerConfig) -> None:
         UserError: one is out of range, two contradict each other, or ABCD cannot do what is asked for.
     """
     pipeline = config.pipeline
-    for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb"):
+    for name in NOT_BELOW_0:
         value = attrgetter(name)(pipeline)
         if not 0 <= value < math.inf:
             flag = name.replace("_", "-")
@@ -146,7 +156,7 @@ def check_options(config: TrainerConfig) -> None:
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
     pipeline.training.check()
-    if pipeline.training.recipe.overlap > 0 and pipeline.blocks == 0:
+    if pipeline.training.recipe.overlap > 0 and pipeline.blocks == pipeline.gaussian_bytes == 0:
         raise UserError("abcd-partition cuts no block that outgrows the device: give --pipeline.blocks.")
     check_workers(config)
     if pipeline.training.seed not in (TrainingConfig.seed, config.machine.seed):

@@ -166,9 +166,11 @@ class BlocksAlone(Visits):
         return inside
 
     def room(self) -> int | None:
-        """The block's part of the scene's limit."""
-        limit = self._run.config.density.limit
-        return None if limit is None else int(limit * self._part) - len(self._run.params["means"])
+        """The block's part of the scene's limit, and what the device leaves."""
+        config = self._run.config
+        limits = [config.limits.sole_limit] if config.limits.sole_limit else []
+        limits += [int(config.density.limit * self._part)] if config.density.limit is not None else []
+        return min(limits) - len(self._run.params["means"]) if limits else None
 
     def compared(
         self, batch: Batch, pictures: Sequence[Tensor], photos: Sequence[Tensor]

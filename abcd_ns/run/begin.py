@@ -37,7 +37,16 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from abcd_ns.run.fit import COARSE_MODEL, FITTED, Demand, Fit, RamShares, device_budget, find_fit
+from abcd_ns.run.fit import (
+    COARSE_MODEL,
+    FITTED,
+    Demand,
+    Fit,
+    RamShares,
+    device_budget,
+    find_fit,
+    fit_gaussians,
+)
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
 from abcd_ns.run.workers import blocks_to_begin_with, number_of_workers
@@ -215,7 +224,8 @@ class RunBuilder:
         training, capture = self._training, self.capture
         most, factor = training.density.limit, capture.factor
         demand = Demand(capture.pixels, gaussians, training, most, factor, blocks, self._on_cpu)
-        return find_fit(self.device_bytes, demand)
+        room = self.options.gaussian_bytes
+        return fit_gaussians(room, demand) if room else find_fit(self.device_bytes, demand)
 
     def _first_cut(self, gaussians: int) -> tuple[int, dict[str, int]]:
         """The number of blocks to begin with, and the limits that are fitted to the device, by name."""
@@ -236,7 +246,8 @@ class RunBuilder:
         grown = max(min(points, training.density.limit or points), gaussians)
         largest = fitted["block_limit"] or -(-grown // blocks)
         training = replace(training, limits=replace(training.limits, **fitted))
-        return coarse_model_size(training, largest, self.capture.pixels)
+        pixels = 0 if self.options.gaussian_bytes else self.capture.pixels
+        return coarse_model_size(training, largest, pixels)
 
     # -- at rest -------------------------------------------------------------------------------------
 

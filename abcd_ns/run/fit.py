@@ -1,5 +1,6 @@
 """What fits this machine: how many blocks, how much of a photo a step draws, and what is kept in RAM."""
 
+import math
 from bisect import bisect_left
 from dataclasses import dataclass, replace
 
@@ -26,11 +27,13 @@ KEPT_SHARE = 0.4
 """Of the machine's RAM for the same, where that is less."""
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
+LEAST_LIMIT = 100
+"""The same where the budget is for Gaussians alone, which small scenes are compared by."""
 PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
-FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels")
+FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians")
 """The limits that follow from the device's memory; a run keeps them."""
 COARSE_MODEL = "scaffold_gaussians"
 """Another, of the warm-up's memory."""
@@ -57,6 +60,8 @@ class Fit:
     """Views in a step, where there are several blocks."""
     crop_pixels: int = 0
     """Pixels of a view in a step at most; 0 is no limit."""
+    pass_gaussians: int = 0
+    """Frozen Gaussians that are drawn at once, at most; 0 is as many as usual."""
 
     @property
     def blocks_at_the_end(self) -> int:
@@ -68,7 +73,8 @@ class Fit:
     @property
     def limits(self) -> dict[str, int]:
         """What of it a run keeps to: FITTED, by name."""
-        return dict(zip(FITTED, (self.limit, self.sole, self.batch, self.crop_pixels), strict=True))
+        values = (self.limit, self.sole, self.batch, self.crop_pixels, self.pass_gaussians)
+        return dict(zip(FITTED, values, strict=True))
 
     def in_words(self) -> str:
         """One line for the terminal."""
@@ -154,6 +160,23 @@ def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory:
     if fit is None:
         raise UserError(_refusal(budget, demand, downscale, memory))
     return fit
+
+
+def fit_gaussians(room: int, demand: Demand) -> Fit:
+    """The fewest blocks whose Gaussians take no more than `room` bytes, pictures and layers apart.
+
+    Raises:
+        UserError: they would have next to none.
+    """
+    training = demand.training
+    views = [views_per_step(training.batch, blocks, training.limits.batch_limit) for blocks in (1, 2)]
+    sole, limit = (room // demand.needs(batch, 0, levels=0).gaussian_bytes for batch in views)
+    if limit < LEAST_LIMIT:
+        raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
+    blocks, overlap = _fewest(demand.first, limit, sole), training.recipe.overlap
+    if overlap > 0:  # an isolated block begins with what lies around its cell, too, and is never cut
+        blocks, limit, sole = _fewest(math.ceil((1 + 2 * overlap) ** 2 * demand.first), limit, 0), 0, limit
+    return Fit(blocks, limit, sole, room, demand.gaussians, views[1], pass_gaussians=2 * limit)
 
 
 def _fit(budget: int, demand: Demand) -> Fit | None:

@@ -18,6 +18,9 @@ class RunOptions:
     device_budget_gb: float = 0.0
     """Device memory for training, GiB. 0 takes 90% of a GPU's free memory, or a quarter of the RAM.
     Of a GPU's, an eighth is for layers and one for photos."""
+    gaussian_bytes: int = 0
+    """Device memory for a block's Gaussians and all that training holds for each, bytes, instead of
+    `device_budget_gb`. Pictures and layers come on top. For comparisons within a budget."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0

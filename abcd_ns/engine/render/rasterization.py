@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
-from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, Shot, make_rasterizer
+from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, Shot, TorchRasterizer, make_rasterizer
 from abcd_ns.engine.types import Gaussians, View
 
 FIXED = {
@@ -18,7 +18,6 @@ FIXED = {
     "packed": False,
     "tile_size": 16,
     "sparse_grad": False,
-    "absgrad": False,
     "channel_chunk": 32,
     "distributed": False,
     "camera_model": "pinhole",
@@ -51,6 +50,7 @@ def rasterization(
     backgrounds: Float[Tensor, "c _d"] | None = None,
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    absgrad: bool = False,
     **fixed: Any,
 ) -> tuple[Float[Tensor, "c height width d"], Float[Tensor, "c height width 1"], dict[str, Any]]:
     """Draw Gaussians by pinhole cameras, as gsplat 1.4.0's `rasterization(packed=False)` does.
@@ -69,6 +69,7 @@ def rasterization(
         sh_degree: in use; at most what k allows.
         backgrounds: behind the colours; depth has none.
         render_mode: D is the sum of weight x camera z, ED the same over alpha; the last channel.
+        absgrad: after backward, `means2d.absgrad` sums each pixel's absolute gradient; on a CPU.
         fixed: see FIXED.
 
     Returns:
@@ -85,7 +86,12 @@ def rasterization(
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
     shots = [Shot(view, view.full) for view in views]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
-    rasters = rasterizer_on(means.device).draw(gaussians, shots, **options)
+    rasterizer = rasterizer_on(means.device)
+    if absgrad:
+        if not isinstance(rasterizer, TorchRasterizer):
+            raise ValueError("absgrad=True is not supported here on a GPU: call gsplat's own rasterization.")
+        options["absgrad"] = True
+    rasters = rasterizer.draw(gaussians, shots, **options)
     color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]

@@ -19,9 +19,6 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians
 
-BEGINS = 0.6
-"""Of what has room in a coarse model, as a share, where there is more: what grows where it is needed is worth
-more than points at random."""
 REVEALED_OPACITY = 0.02
 """Of a Gaussian of the deferred points, once it is seen: enough to be drawn and to learn, too little to spoil
 what is there."""
@@ -48,14 +45,12 @@ def blocks_at_rest(
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
 
     Args:
-        room: for Gaussians in the coarse model. If not all have room, it begins with `BEGINS` of as many, so
-            that it can grow; the others are deferred. None for no warm-up.
+        room: for Gaussians in the coarse model; others are deferred. None for no warm-up.
     """
     if room is None:
         at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
-    begins = len(gaussians) if len(gaussians) <= room else math.ceil(BEGINS * room)
-    coarse_model, deferred = split_off(gaussians, begins, seed)
+    coarse_model, deferred = split_off(gaussians, min(room, len(gaussians)), seed)
     points = BlockState.fresh(deferred).packed()
     return {**blocks_at_rest(tree, coarse_model), DEFERRED: points}

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.compare.budgets import ALONE, JOINT, WITHIN, draw_budgets, shares_of, within_budgets
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Method, Plan, Settings, TerrainJob, TerrainSettings, scene_name
@@ -38,7 +39,8 @@ class Options:
     """Folder for the results; absent, empty, or one of an earlier comparison under the same protocol."""
     methods: Annotated[tuple[Method, ...] | None, words("METHOD ...")] = None
     """Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact, abcd-paper
-    (needs steps) and splatfacto (needs CUDA). Where something else than methods has arms: abcd."""
+    (needs steps), splatfacto, and splatfacto-scaled (needs steps): all its schedules, made for 30,000 steps,
+    reduced to as many. Where something else than methods has arms: abcd."""
     seconds: Annotated[float | None, words("S")] = None
     """Budget of a run: seconds of training; evaluation, saving and compiling do not count."""
     steps: Annotated[int | None, words("N")] = None
@@ -60,6 +62,9 @@ class Options:
     """In each tile of the terrain. Default: 20,000."""
     visits: Annotated[int | None, words("N")] = None
     """Budget of a run on the terrain. Default: 3."""
+    budgets: Annotated[tuple[str, ...] | None, words("SHARE ...")] = None
+    """An arm for each share, such as 1/4, of the memory that abcd-monolithic takes for Gaussians.
+    Each method of ABCD's keeps to it. abcd-monolithic and splatfacto also run without a limit."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
     max_gaussians: Annotated[int | None, words("N")] = None
@@ -122,6 +127,8 @@ def compare(
 
     abcd compare --data scene --seconds 60 --vary training.warmup=0 training.batch=1 --out options
 
+    abcd compare --data scene --steps 4000 --budgets 1/2 1/4 1/8 --methods abcd splatfacto --out budgets
+
     abcd compare --tiles 2 4 8 16 32 64 --methods abcd abcd-monolithic --out sizes
 
     Args:
@@ -132,7 +139,8 @@ def compare(
     Raises:
         UserError: an option or the scene cannot be used, or OUT holds something else.
     """
-    plan = make_plan(options.over(read_options(config)) if config else options)
+    options = options.over(read_options(config)) if config else options
+    plan = make_plan(options)
     if plan.kind != TERRAIN:
         # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
         from abcd_ns.lab.runs.configs import check_options, check_scene
@@ -140,7 +148,12 @@ def compare(
         for job in plan.jobs:
             check_options(job)
         check_scene(plan.jobs[0])
-    return carry_out(plan, Console(), overwrite)
+    console = Console()
+    if options.budgets:
+        *_, ceilings = run_jobs(plan, console, overwrite)
+        methods = options.over(DEFAULTS).methods
+        plan, overwrite = within_budgets(plan, ceilings, methods, shares_of(options.budgets)), False
+    return carry_out(plan, console, overwrite)
 
 
 def read_options(path: Path) -> Options:
@@ -171,6 +184,8 @@ def make_plan(options: Options) -> Plan:
     given = dataclasses.replace(given, methods=tuple(m for m in METHODS if m in given.methods))
     if given.tiles is not None:
         return _terrain_plan(given)
+    if given.budgets is not None:
+        return _budgets_plan(given, options)
     settings, arms = _settings(given), arms_of(given)
     jobs = tuple(
         Job(method, seed, settings, changes)
@@ -178,6 +193,19 @@ def make_plan(options: Options) -> Plan:
         for method in given.methods
         for changes in dict.fromkeys(_for_method(changes, method, settings) for changes in arms)
     )
+    return Plan("comparison", settings, Path(given.out), jobs, _command(given))
+
+
+def _budgets_plan(given: Options, asked: Options) -> Plan:
+    """The runs without a limit: what budgets are shares of, and ceilings."""
+    shares_of(given.budgets)
+    if others := {"blocks", "prices", "vary", "max_gaussians"} & asked.given.keys():
+        raise UserError(f"--{min(others).replace('_', '-')} does not go with --budgets.")
+    if others := set(given.methods) - {*WITHIN, *ALONE}:
+        raise UserError(f"{min(others)} keeps to no budget: leave it out.")
+    settings = dataclasses.replace(_settings(given), blocks=0)
+    methods = [m for m in METHODS if m == JOINT or (m in ALONE and m in given.methods)]
+    jobs = tuple(Job(method, seed, settings) for seed in given.seeds for method in methods)
     return Plan("comparison", settings, Path(given.out), jobs, _command(given))
 
 
@@ -244,7 +272,7 @@ def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
     for results in run_jobs(plan, console, overwrite):
         paths = write_report(results, plan.out)  # each time: a long one may be interrupted
-    paths += draw_charts(results, plan.out)
+    paths += [*draw_charts(results, plan.out), *draw_budgets(results, plan.out)]
     if plan.kind != TERRAIN:
         paths += draw_pictures(shown(results, plan), plan.out / PICTURES)
     if results.arms:
@@ -267,10 +295,8 @@ def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
 def _check_methods(given: Options) -> None:
     if not given.methods or len(set(given.methods)) < len(given.methods):
         raise UserError("Give at least one of --methods, and each once.")
-    if "abcd-paper" in given.methods and given.steps is None:
-        raise UserError(
-            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
-        )
+    if given.steps is None and (counted := {"abcd-paper", "splatfacto-scaled"} & set(given.methods)):
+        raise UserError(f"The schedule of {min(counted)} is in steps: use --steps instead of --seconds.")
 
 
 def _settings(given: Options) -> Settings:
@@ -303,7 +329,7 @@ def _settings(given: Options) -> Settings:
 
 def _for_method(changes: tuple[str, ...], method: str, settings: Settings) -> tuple[str, ...]:
     """What of an arm applies to a method: one block is one block, and splatfacto has its own options."""
-    if method == "splatfacto":
+    if method in ALONE:
         return ()
     if method == "abcd-monolithic" and not settings.blocks:
         return tuple(change for change in changes if not change.startswith("blocks="))

@@ -8,6 +8,7 @@ from typing import Any
 from abcd_ns.lab.job import Settings
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.machine import Machine, Versions
+from abcd_ns.units import bytes_in_words
 
 SCHEMA = 2
 """Raised whenever a field changes its name or meaning."""
@@ -120,6 +121,7 @@ class Results:
             words = [re.sub(r"^[\w.]+\.(\w+=)", r"\1", word) for word in arm.variant.split()]
             words = [re.sub(r"^(block|tile)s=(\d+)$", r"\2 \1s", word) for word in words]
             words = [re.sub(r"^1 (\w+)s$", r"1 \1", word) for word in words if word != "default"]
+            words = [re.sub(r"^gaussian_bytes=(\d+)$", lambda m: bytes_in_words(int(m[1])), w) for w in words]
             found[arm.name] = ", ".join([arm.method] * (len(self.methods) > 1) + words) or arm.method
         return found
 

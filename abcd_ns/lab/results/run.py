@@ -89,6 +89,10 @@ class Run:
     spz_bytes: int | None = None
     """Likewise as an .spz in the run's frame, in which harmonics that are nothing take next to nothing; None
     also where the package is missing that packs it."""
+    gaussian_bytes: int | None = None
+    """The most that Gaussians in training and all that is held for each of them took, or they and frozen ones
+    that were drawn: by counts at each step, and `memory.DeviceNeeds`. Pictures and layers are apart. None in
+    results of versions that did not count, and of methods that hold no block for longer than a drawing."""
     memory: "Footing | None" = None
     """What `abcd compare --tiles` asks beyond."""
 

@@ -19,6 +19,7 @@ LOOKS = {
     "abcd-exact": ("#B3306B", "X"),
     "abcd-paper": ("#7A3E00", "P"),
     "splatfacto": ("#007A5A", "D"),
+    "splatfacto-scaled": ("#5B9B3A", "d"),
 }
 """Colours after Okabe and Ito 2008, told apart with every kind of colour blindness, darkened where text needs
 it; and markers, for print without colour."""

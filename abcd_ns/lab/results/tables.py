@@ -62,6 +62,7 @@ MEASURES = (
     Measure("whole process (s)", "total_seconds", 1),
     Measure("peak GPU memory (GiB)", "peak_device_bytes", 2, GIB),
     Measure("peak GPU memory, reserved (GiB)", "peak_reserved_bytes", 2, GIB),
+    Measure("peak of Gaussians (MiB)", "gaussian_bytes", 2, MIB),
     Measure("peak RAM (GiB)", "peak_rss_bytes", 2, GIB),
     Measure("blocks on disk (MiB)", "store_bytes", 1, MIB),
     Measure("visit (s)", "memory.visit_seconds", 1),

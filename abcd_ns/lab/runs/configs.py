@@ -4,15 +4,18 @@ import copy
 import dataclasses
 from pathlib import Path
 
+import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
 from abcd_ns.engine.space.partition import MAX_BLOCKS
+from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import HELD_OUT_EVERY, METHODS, Job
 from abcd_ns.lab.runs.options import change_options
-from abcd_ns.lab.runs.splatfacto import Splatfacto, SplatfactoData
+from abcd_ns.lab.runs.splatfacto import Splatfacto, SplatfactoData, scaled
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.options import mirror
@@ -21,12 +24,12 @@ from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
-_REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name != "splatfacto"}
+_REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name.startswith("abcd")}
 
 
 def trainer_config(job: Job, out: Path) -> TrainerConfig:
     """What the job trains with; its files go to `job.folder(out)`."""
-    config = _splatfacto(job) if job.method == "splatfacto" else _abcd(job)
+    config = _abcd(job) if job.method in _REGISTERED else _splatfacto(job)
     settings = job.settings
     config.output_dir, config.experiment_name, config.timestamp = out, "runs", job.folder(out).name
     config.machine.seed = job.seed
@@ -84,6 +87,9 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     if not settings.densify:
         pipeline.training.density.strategy = "off"
     change_options(pipeline, job.changes)
+    if pipeline.gaussian_bytes and job.method == "abcd-monolithic":
+        needs = DeviceNeeds(0, views_per_step(pipeline.training.batch, 1), pipeline.training.sh_degree)
+        pipeline.training.density.max_gaussians = pipeline.gaussian_bytes // needs.gaussian_bytes
     return config
 
 
@@ -98,7 +104,10 @@ def _splatfacto(job: Job) -> TrainerConfig:
         dataparser=_parser(job),
         cache_images_type="uint8",
     )
-    config.pipeline.model._target = Splatfacto
+    config.method_name, config.pipeline.model._target = job.method, Splatfacto
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    if job.method == "splatfacto-scaled":
+        config = scaled(config, job.settings.steps)
     if not job.settings.densify:
         config.pipeline.model.stop_split_at = 0
     return config

@@ -17,10 +17,13 @@ from nerfstudio.engine.trainer import Trainer
 from PIL import Image
 from torch import Tensor
 
-from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
+from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.layers.layer_renderer import default_pass
+from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
+from abcd_ns.errors import UserError
 from abcd_ns.formats.sizes import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
@@ -32,6 +35,7 @@ from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 from abcd_ns.run import STORE
+from abcd_ns.units import bytes_in_words
 
 
 def run(job: Job, folder: Path) -> Run:
@@ -45,6 +49,10 @@ def run(job: Job, folder: Path) -> Run:
     """
     training = set_up(job, folder.parent.parent.parent)
     training.trainer.train()
+    budget = getattr(training.trainer.config.pipeline, "gaussian_bytes", 0)
+    if budget and training.gaussian_bytes > budget:
+        held, given = bytes_in_words(training.gaussian_bytes), bytes_in_words(budget)
+        raise UserError(f"Gaussians took {held} of a budget of {given}")
     total = time.time() - psutil.Process().create_time() - training.seconds_of_looks
     memory = memory_of_run()
     scores, gaps = score_held_out(training, job, folder / "pictures")
@@ -68,6 +76,7 @@ def run(job: Job, folder: Path) -> Run:
         parameters=training.parameters,
         **file_bytes(training),
         **memory,
+        gaussian_bytes=training.gaussian_bytes or None,
         store_bytes=disk_bytes(folder / "abcd" / STORE),
         layer_seconds=training.layer_seconds,
         curve=(*training.points, end),
@@ -105,6 +114,7 @@ class Training:
         """None for splatfacto, whose steps and time are counted here."""
         self.points: list[CurvePoint] = []
         self.layer_seconds = self.seconds_of_looks = 0.0
+        self.gaussian_bytes = 0
         self._moments = [moment for moment in settings.moments if moment < 1]
         if self.coordinator is not None:
             self.stopwatch = self.coordinator.stopwatch
@@ -121,11 +131,31 @@ class Training:
     def _listen(self, event: Event) -> None:
         if isinstance(event, VisitEnded):
             self.layer_seconds += event.layer_seconds
+        if isinstance(event, (StepTaken, VisitBegan)):
+            self._note_held(drawing=isinstance(event, VisitBegan))
         if isinstance(event, (StepTaken, VisitEnded)):
             self._look()
 
+    def _note_held(self, drawing: bool) -> None:
+        """Count what is held now.
+
+        Args:
+            drawing: layers are about to be drawn, and steps have not begun.
+        """
+        coordinator = self.coordinator
+        config, live = coordinator.config, len(coordinator.params["means"])
+        needs = DeviceNeeds(0, coordinator.batch, config.sh_degree, primitive=config.primitive)
+        held = live * needs.gaussian_bytes
+        if drawing:  # parameters and their moments, and of others so many as one pass draws
+            most = config.limits.pass_gaussians or default_pass(coordinator.scene)
+            frozen = min(most, coordinator.count() - live) if config.recipe.layers else 0
+            held = live * 3 * needs.parameter_bytes
+            held += frozen * drawing_bytes(config.sh_degree, config.primitive)
+        self.gaussian_bytes = max(self.gaussian_bytes, held)
+
     def _end_step(self, step: int) -> None:
         self._steps = step + 1  # the trainer's own count is one higher once it has been stopped
+        self.gaussian_bytes = max(self.gaussian_bytes, self.gaussians * DeviceNeeds(0, 1).gaussian_bytes)
         self._look()
         if self.progress >= 1:
             self.stopwatch.pause()

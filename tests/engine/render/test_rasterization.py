@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from abcd_ns import rasterization
+from abcd_ns.engine.kernels.native import library
 from abcd_ns.engine.render.rasterization import FIXED
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
@@ -124,3 +125,22 @@ def test_what_is_not_supported_is_refused_in_one_line(options, kind, says):
     with pytest.raises(kind, match=says) as refused:
         drawn(random_gaussians(3), **options)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.skipif(library() is None, reason="no C++ compiler")
+def test_absolute_gradients_are_sums_over_pixels():
+    gaussians, view = random_gaussians(12).to(torch.float32), small_view(19, 11, torch.float32)
+    gaussians = Gaussians(**{name: value.requires_grad_() for name, value in gaussians.items()})
+    torch.manual_seed(0)
+    target = torch.rand(1, view.height, view.width, 3)
+    pictures, _, meta = drawn(gaussians, [view], absgrad=True)
+    meta["means2d"].retain_grad()
+    (pictures - target).square().sum().backward()
+    found, expected = meta["means2d"].absgrad, torch.zeros_like(meta["means2d"])
+    for pixel in range(view.height * view.width):
+        pictures, _, one = drawn(gaussians, [view])
+        one["means2d"].retain_grad()
+        (pictures - target).square().flatten(1, 2)[0, pixel].sum().backward()
+        expected += one["means2d"].grad.abs()
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+    assert (found > meta["means2d"].grad.abs() - 1e-4).all()

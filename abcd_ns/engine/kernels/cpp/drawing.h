@@ -12,7 +12,8 @@
 
 namespace drawing {
 constexpr int SIDE = 4, PIXELS = SIDE * SIDE, VECTORS = PIXELS / LANES;
-constexpr int CHANNELS = 3, RESIDUAL = 4, GROWTH = 10;  // w f, w r, w r x, w r y
+constexpr int CHANNELS = 3, RESIDUAL = 4;
+constexpr int GROWTH = 10, ABSOLUTE = 2;  // sums of w f, w r, w r x, w r y; of |dL/dx|, |dL/dy|
 constexpr int64_t AT_ONCE = 4096;
 constexpr int AHEAD = 4;  // records are fetched so many before they are needed
 
@@ -338,9 +339,9 @@ static void draw(Lists& lists, const Picture* windows, const Image* images, bool
 }
 
 // A few Gaussians of a tile that wait to be added up: their weights and dL/dsigma by pixel.
-template <class Shape, bool GROWS>
+template <class Shape, int EXTRA>
 struct Batch {
-  static constexpr int SUMS = Shape::SUMS + (GROWS ? GROWTH : 0), PADDED = (SUMS + LANES - 1) / LANES * LANES;
+  static constexpr int SUMS = Shape::SUMS + EXTRA, PADDED = (SUMS + LANES - 1) / LANES * LANES;
   V weight[LANES][VECTORS], grad[LANES][VECTORS];
   int32_t id[LANES];
   int n = 0;
@@ -369,8 +370,9 @@ struct Batch {
         const int p = v * LANES + l, px = p % SIDE, py = p / SIDE;
         Shape::add(r, dx[px], dy[py], s[l], found);
         for (int c = 0; c < 4; c++) found[Shape::COLORS + c] += w[l] * up[c][p];
-        if (GROWS) {
-          V* more = found + Shape::SUMS;
+        V* more = found + Shape::SUMS;
+        if (EXTRA == ABSOLUTE) Shape::add_absolute(r, dx[px], dy[py], s[l], more);
+        if (EXTRA == GROWTH) {
           more[0] += w[l] * residual[CHANNELS][p];
           for (int c = 0; c < CHANNELS; c++) {
             const V asks = w[l] * residual[c][p];
@@ -395,10 +397,10 @@ struct Batch {
 // With e_k = dL/dC . (c_k, z_k), w_k = alpha_k T_k and total = sum of all w_k e_k + T dL/dT at the end:
 //     dL/dalpha_k = T_k e_k - (total - sum of w_j e_j for j <= k) / (1 - alpha_k)
 // so that front to back serves as well as back to front.
-template <class Shape, bool GROWS>
+template <class Shape, int EXTRA>
 static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image* drawn, float* rows,
-                      float* weights, float* growth) {
-  using Few = Batch<Shape, GROWS>;
+                      float* weights, float* extra) {
+  using Few = Batch<Shape, EXTRA>;
   std::vector<std::vector<float>> sums(lists.bands.size());
   parallel(int64_t(lists.bands.size()), [&](int64_t b) {
     Band& band = lists.bands[b];
@@ -419,7 +421,7 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
             up[c][k] = grad.color[3 * p + c], total[k] += up[c][k] * picture_drawn.color[3 * p + c];
         if (grad.depth) up[3][k] = grad.depth[p], total[k] += up[3][k] * picture_drawn.depth[p];
         if (grad.transmittance) total[k] += grad.transmittance[p] * picture_drawn.transmittance[p];
-        if (GROWS)
+        if (EXTRA == GROWTH)
           for (int c = 0; c < RESIDUAL; c++) residual[c][k] = grad.residual[RESIDUAL * p + c];
       });
       V e[4][VECTORS], rest[VECTORS];
@@ -468,8 +470,7 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
         if (weights) weights[column] += g[2], g[2] = 0;
         float* to = rows + (column - within) * Shape::ROWS + within;
         for (int c = 0; c < Shape::GRADED; c++) to[c * part.count] += g[c];
-        if (GROWS)
-          for (int c = 0; c < GROWTH; c++) growth[GROWTH * column + c] += s[Shape::SUMS + c];
+        for (int c = 0; c < EXTRA; c++) extra[EXTRA * column + c] += s[Shape::SUMS + c];
       }
     }
   });
@@ -558,13 +559,15 @@ extern "C" void abcd_free(Lists* lists) { delete lists; }
 extern "C" void abcd_draw(Lists* lists, const Picture* windows, const Image* images, int keep) {
   OF_SHAPE(lists, draw)(*lists, windows, images, keep);
 }
-// `rows` [views, rows, n], `weights` [views, n] (or null) and `growth` [views, n, 10] (or null) are zero before.
+// `rows` [views, rows, n], `weights` [views, n] (or null) and `extra` [views, n, sums] are zero before; `sums` is
+// GROWTH, or ABSOLUTE (of splats), or 0.
 extern "C" void abcd_draw_back(Lists* lists, int64_t own, const Image* grads, const Image* drawn, float* rows,
-                               float* weights, float* growth) {
+                               float* weights, float* extra, int64_t sums) {
   using namespace drawing;
-  auto back = growth ? (lists->is_surfel ? draw_back<Surfel, true> : draw_back<Splat, true>)
-                     : (lists->is_surfel ? draw_back<Surfel, false> : draw_back<Splat, false>);
-  back(*lists, own, grads, drawn, rows, weights, growth);
+  auto back = lists->is_surfel     ? (sums ? draw_back<Surfel, GROWTH> : draw_back<Surfel, 0>)
+              : sums == ABSOLUTE ? draw_back<Splat, ABSOLUTE>
+                                 : (sums ? draw_back<Splat, GROWTH> : draw_back<Splat, 0>);
+  back(*lists, own, grads, drawn, rows, weights, extra);
 }
 extern "C" void abcd_windows(Lists* lists, float visible, float* near, float* far, double* held, double* mass) {
   OF_SHAPE(lists, windows)(*lists, visible, near, far, held, mass);

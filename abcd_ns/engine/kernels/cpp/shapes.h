@@ -61,6 +61,12 @@ struct Splat {
     sums[3] += s_dx * dx, sums[4] += s_dx * dy, sums[5] += s_dy * dy;
   }
 
+  // Adds the absolute gradient of the middle that a pixel gives, as gsplat's absgrad.
+  static void add_absolute(const V* r, V dx, V dy, V s, V* sums) {
+    const V x = s * (2 * r[3] * dx + r[4] * dy), y = s * (r[4] * dx + 2 * r[5] * dy);
+    sums[0] += vmax(x, -x) / LOG2_E, sums[1] += vmax(y, -y) / LOG2_E;
+  }
+
   static void to_rows(const float* r, const float* p, int64_t row, const float* s, float* g) {
     const float a = p[3 * row], b = p[4 * row], c = p[5 * row];
     g[0] = a * s[1] + b * s[2], g[1] = b * s[1] + c * s[2], g[2] = s[9];
@@ -136,6 +142,8 @@ struct Surfel {
     const V on_disc = 0.5f * (s * s + t * t), ex = dx + r[3], ey = dy + r[4];
     return alpha_of(splat(0) + r[12], LOG2_E * vmin(on_disc, ex * ex + ey * ey), meets);
   }
+
+  static void add_absolute(const V*, V, V, V, V*) {}  // gsplat has none of surfels here
 
   static void add(const V* r, V dx, V dy, V g, V* sums) {
     V s, t, inverse;

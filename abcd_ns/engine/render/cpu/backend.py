@@ -94,8 +94,14 @@ class TorchRasterizer(Rasterizer):
         antialiased: bool = False,
         blend_weights: bool = False,
         judge: bool = False,
+        absgrad: bool = False,
     ) -> tuple[Raster, ...]:
-        """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
+        """See Rasterizer.draw. One pass for all shots: overheads are paid once.
+
+        Args:
+            absgrad: after backward `info["means2d"].absgrad` [v, n, 2] is gsplat's: sums of each pixel's
+                absolute gradient. By the native kernel, of 3dgs.
+        """
         planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
         center = slice(self.primitive.center, self.primitive.center + 2)
         takes = planes.requires_grad
@@ -108,12 +114,14 @@ class TorchRasterizer(Rasterizer):
             parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
             parts += [native.Part(others, k, True) for k, others in frozen]
             lists = native.Lists(parts, crops, self.primitive, windows, wants_weights=blend_weights)
-            drawing = native.Drawing(lists)
+            drawing = native.Drawing(lists, means2d=means2d if absgrad else None)
             info |= {"sums": drawing} if judge else {}
             drawn = iter(native.Composite.apply(planes, means2d, weights, drawing))
             return tuple(
                 Raster(color, left, depth, info) for color, left, depth in zip(*[drawn] * 3, strict=True)
             )
+        if absgrad:
+            raise ValueError("absgrad takes the native kernel: float32 on a CPU, and a compiler")
         images, sums = self._composited_in_torch(planes, shots, means2d, weights)
         info |= {"sums": sums} if judge else {}
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)

@@ -200,6 +200,8 @@ class Drawing:
     residuals: list[Tensor] | None = None
     values: Tensor | None = None
     """See ResidualSums."""
+    means2d: Tensor | None = None
+    """Gets gsplat's `absgrad` [v, n, 2], if given; then no residuals are asked."""
 
     def ask(self, residuals: Sequence[Tensor]) -> None:
         """See ResidualSums."""
@@ -232,7 +234,8 @@ class Composite(torch.autograd.Function):
         lists, center = drawing.lists, drawing.lists.primitive.center
         rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.wants_weights else None
         residuals = drawing.residuals
-        drawing.values = torch.zeros((views, n, SUMS)) if residuals else None
+        width = SUMS if residuals else 0 if drawing.means2d is None else 2
+        extra = torch.zeros((views, n, width)) if width else None
         held = [None if grad is None else grad.contiguous() for grad in grads]
         asked = [held[k : k + 3] for k in range(0, len(held), 3)]
         if residuals:
@@ -243,6 +246,11 @@ class Composite(torch.autograd.Function):
             ctypes.c_int64(views * n),
             _as_images(asked),
             _as_images(drawn),
-            *(_POINTER(address(each)) for each in (rows, weights, drawing.values)),
+            *(_POINTER(address(each)) for each in (rows, weights, extra)),
+            ctypes.c_int64(width),
         )
+        if residuals:
+            drawing.values = extra
+        elif drawing.means2d is not None:
+            drawing.means2d.absgrad = extra
         return rows, rows[:, center : center + 2].transpose(1, 2).contiguous(), weights, None
