@@ -15,9 +15,8 @@ from abcd_ns.cluster.assignment import Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
@@ -37,10 +36,19 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from abcd_ns.run.fit import COARSE_MODEL, FITTED, Demand, Fit, RamShares, device_budget, find_fit
+from abcd_ns.run.fit import (
+    COARSE_MODEL,
+    FITTED,
+    Demand,
+    Fit,
+    RamShares,
+    blocks_to_begin_with,
+    device_budget,
+    find_fit,
+    number_of_workers,
+)
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
-from abcd_ns.run.workers import blocks_to_begin_with, number_of_workers
 
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
 """Starts workers on GPUs or other machines. Takes what they have in common, their number, and the bytes of
