@@ -22,7 +22,6 @@ from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.active_block import ActiveBlock
 from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered, Sample, Target
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
@@ -42,7 +41,6 @@ class Coordinator(Trainer):
         visits: decides which; None for ABCD's own.
         source: gives visits their layers; None for the run's scene, and little room.
         target: gives what a sample is trained on; needed where poses are refined, and for a final pruning.
-        live: the block in training; None for one that nobody else looks after.
     """
 
     def __init__(
@@ -51,11 +49,10 @@ class Coordinator(Trainer):
         visits: Visits | None = None,
         source: LayerSource | None = None,
         target: Callable[[Sample], Target] | None = None,
-        live: ActiveBlock | None = None,
     ) -> None:
         super().__init__(run)
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
-        self.visit = VisitTraining(run, self.visits, self.source, live)
+        self.visit = VisitTraining(run, self.visits, self.source)
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
@@ -181,7 +178,7 @@ class Coordinator(Trainer):
         if (active := self.state.active) is not None:
             self.health.look_over()
             self.scene.make_room()
-            updates = {LIVE: self.visit.live.detached().unpinned()}
+            updates = {LIVE: self.visit.live.detached()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()

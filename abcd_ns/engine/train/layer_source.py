@@ -1,6 +1,6 @@
 """Where a visit's layers come from: the frozen blocks, drawn around the one that is to be trained."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from abcd_ns.engine.events import LayersDrawn
@@ -34,17 +34,10 @@ class LayerRoom:
 
 
 class LayerSource:
-    """Draws what is frozen around a block.
+    """Draws what is frozen around a block."""
 
-    Args:
-        around: gives the scene that neighbours are drawn from; None for the run's own, as it is by then.
-    """
-
-    def __init__(
-        self, run: TrainingRun, room: LayerRoom | None = None, around: Callable[[], BlockScene] | None = None
-    ) -> None:
+    def __init__(self, run: TrainingRun, room: LayerRoom | None = None) -> None:
         self._run, self.room = run, room or LayerRoom()
-        self._around = around or (lambda: run.scene)
 
     def draw(self, active: ActiveVisit, views: Iterable[int]) -> VisitLayers | None:
         """F and B of these views, or None where nothing is around the block; listeners hear of each."""
@@ -53,7 +46,7 @@ class LayerSource:
             return None
         painted = list(run.views.values())
         layers = VisitLayers(
-            renderer_of(run, self._around(), painted),
+            renderer_of(run, run.scene, painted),
             LayerStore(run.device, self.room.device, self.room.ram),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),

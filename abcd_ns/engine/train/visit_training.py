@@ -14,7 +14,7 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, gradients_of
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
@@ -36,10 +36,10 @@ from abcd_ns.engine.train.step.batch import (
     Batch,
     Pictures,
     Rendered,
+    Residuals,
     Sample,
     part_to_draw,
 )
-from abcd_ns.engine.train.step.residuals import Residuals
 from abcd_ns.engine.types import Crop, View
 
 
@@ -49,18 +49,11 @@ class VisitTraining:
     Args:
         visits: on what terms the block is trained.
         source: gives visits their layers.
-        live: the block in training; None for one that nobody else looks after.
     """
 
-    def __init__(
-        self,
-        run: TrainingRun,
-        visits: Visits,
-        source: LayerSource,
-        live: ActiveBlock | None = None,
-    ) -> None:
+    def __init__(self, run: TrainingRun, visits: Visits, source: LayerSource) -> None:
         self.run, self._visits, self._source = run, visits, source
-        self.live = ActiveBlock(run) if live is None else live  # one that is empty yet is false
+        self.live = ActiveBlock(run)
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
@@ -192,7 +185,9 @@ class VisitTraining:
             return
         damping = exponential_decay(run.progress, LAST_RATE)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
-        run.light.step(gradients_of(rendered.lights), share * damping)
+        lights = zip(rendered.views, rendered.lights, strict=True)
+        gradients = [(view.index, light.grad) for view, light in lights if light.grad is not None]
+        run.light.step(gradients, share * damping)
 
     @property
     def is_over(self) -> bool:
@@ -268,14 +263,9 @@ class VisitTraining:
             judge=self._asks,
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
-        lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]
-        uses = [
-            (sample.view.index, transform)
-            for sample, transform in zip(samples, lights, strict=True)
-            if transform is not None
-        ]
-        pictures = self._pictures(samples, rasters, lights)
-        return Rendered(pictures, rasters, infos, uses, tuple(sample.view for sample in samples))
+        views = tuple(sample.view for sample in samples)
+        lights = tuple(None if run.light is None else run.light.of(view.index) for view in views)
+        return Rendered(self._pictures(samples, rasters, lights), rasters, infos, lights, views)
 
     def _pictures(
         self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]
