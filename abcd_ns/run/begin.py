@@ -26,7 +26,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_at_rest
-from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, coarse_model_size
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
@@ -185,14 +185,14 @@ class RunBuilder:
         options, blocks = self.options, run.scene.tree.num_blocks
         layers = self.ram.layers  # on the CPU, RAM is the device
         room = LayerRoom(layers) if self._on_cpu else LayerRoom(int(LAYER_SHARE * self.device_bytes), layers)
-        source, target = LayerSource(run, room), self.capture.target
+        target = self.capture.target
         # Where RAM is short, one process: each reads blocks for itself.
         wanted = options.workers or int(options.ram_budget_gb > 0)
         count = number_of_workers(wanted, blocks, run.config, self.device)
         if blocks > 1 and (count > 1 or options.cluster is not None):
             workers, lag = self._workers(run, count, room)
-            return Dispatcher(run, workers, lag, source, target)
-        return Coordinator(run, source=source, target=target)
+            return Dispatcher(run, workers, lag, room, target)
+        return Coordinator(run, room=room, target=target)
 
     def _workers(self, run: TrainingRun, count: int, room: LayerRoom) -> tuple[Workers, int | None]:
         """Forked on the cores of this machine, else remote ones; and the dispatcher's lag.

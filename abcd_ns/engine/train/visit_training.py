@@ -17,7 +17,7 @@ from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.health.health_rules import share_of_picture
-from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -48,11 +48,11 @@ class VisitTraining:
 
     Args:
         visits: on what terms the block is trained.
-        source: gives visits their layers.
+        room: for layers.
     """
 
-    def __init__(self, run: TrainingRun, visits: Visits, source: LayerSource) -> None:
-        self.run, self._visits, self._source = run, visits, source
+    def __init__(self, run: TrainingRun, visits: Visits, room: LayerRoom) -> None:
+        self.run, self._visits, self._room = run, visits, room
         self.live = ActiveBlock(run)
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
@@ -89,7 +89,7 @@ class VisitTraining:
         # None where nobody knows how many steps it will have, and its views are drawn in turn.
         taken = 0 if active.is_alone else active.steps * self.batch
         self._order = view_order(active.views, taken, active.number, run.config.seed)
-        self.layers = self._source.draw(active, self._order[active.done * self.batch :])
+        self.layers = layers_of_visit(run, self._room, active, self._order[active.done * self.batch :])
         active.layer_seconds += run.stopwatch.seconds - before
         if active.done == 0 and active.looked_at:
             state.influence[block].update(self._shown_in(active.looked_at))
@@ -139,11 +139,6 @@ class VisitTraining:
         if run.config.density.strategy == "mcmc":
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
-
-    @property
-    def _asks(self) -> bool:
-        run = self.run
-        return run.density.asks(run.share, self.live.clocks.visits == 0)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
@@ -212,7 +207,7 @@ class VisitTraining:
         self.live.shrink_oversized()
         if not active.is_whole:
             self.live.count_visit()
-        state = self.run.health.end_visit(active, self.live.detached)
+        state = self.run.health.end_visit(self.live.detached)
         self.layers = None
         return state
 
@@ -260,7 +255,7 @@ class VisitTraining:
             sh_degree=self.degree,
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
-            judge=self._asks,
+            judge=run.density.asks(run.share, first=self.live.clocks.visits == 0),
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         views = tuple(sample.view for sample in samples)

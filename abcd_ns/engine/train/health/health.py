@@ -116,14 +116,14 @@ class Health:
         self._forget_moments("scales", rows)
         self.count("giants", len(rows))
 
-    def end_visit(self, active: ActiveVisit, detach: Callable[[], BlockState]) -> BlockState:
+    def end_visit(self, detach: Callable[[], BlockState]) -> BlockState:
         """What the visit leaves behind: the live block, repaired.
 
         Args:
             detach: takes the live block out.
         """
         self.look_over()
-        state, record = detach(), self._record
+        state, record, active = detach(), self._record, self._active
         record.visits += 1
         if active.done:  # else time ran out before anybody could see
             record.hidden = not active.shown
