@@ -66,7 +66,9 @@ class MadeFor:
 
     def differences(self, store: ParameterStore) -> str:
         """What `store` was made for that is otherwise here, in words; empty where nothing is."""
-        theirs, mine = store.header[MADE_FOR], asdict(self)
+        theirs, mine = store.header.get(MADE_FOR), asdict(self)
+        if theirs is None:  # nothing was written down
+            return ""
         different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
         return "; ".join(
             f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different
