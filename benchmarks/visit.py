@@ -24,8 +24,10 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.layer_source import layers_of_visit
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
@@ -99,9 +101,9 @@ def run(
     """
     coordinator = begin(capture, blocks, args, folder)
     clock, views = StageClock(), 0
-    scene, source = coordinator.scene, coordinator.source
+    scene = coordinator.scene
     scene.rest = clock.timed("commit", scene.rest)  # as far as the training waits for it
-    source.draw = clock.timed("layers", source.draw)
+    visit_training.layers_of_visit = clock.timed("layers", layers_of_visit)
     while not coordinator.finished:
         if coordinator.progress < 0.5:
             clock.seconds.clear()

@@ -33,7 +33,7 @@ from abcd_ns.engine.store.assigned_scene import Outlines
 from abcd_ns.engine.store.commit import commit, has_coarse_model, with_pending
 from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import BlocksBusyError
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -68,7 +68,7 @@ class Dispatcher(Coordinator):
 
     Args:
         lag: see above; None takes SLACK for each worker. Fewer where there are fewer blocks.
-        source, target: see Coordinator.
+        room, target: see Coordinator.
     """
 
     def __init__(
@@ -76,10 +76,10 @@ class Dispatcher(Coordinator):
         run: TrainingRun,
         workers: Workers,
         lag: int | None = None,
-        source: LayerSource | None = None,
+        room: LayerRoom | None = None,
         target: Callable[[Sample], Target] | None = None,
     ) -> None:
-        super().__init__(run, source=source, target=target)
+        super().__init__(run, room=room, target=target)
         self.workers, self._lag = workers, lag or SLACK * workers.count
         self._in_flight: list[InFlight] = []
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}

@@ -19,7 +19,7 @@ from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.store.assigned_scene import AssignedScene
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
@@ -109,7 +109,7 @@ class VisitWorker:
         run.stopwatch = Stopwatch(task.seconds, clock)
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
-        training = VisitTraining(run, OnAssignment(run, task, len(state)), LayerSource(run, layers))
+        training = VisitTraining(run, OnAssignment(run, task, len(state)), layers)
         training.attach(run.active)
         shared = SharedResidual(run, training, scene.as_drawn, task.beside, pictures)
         while not training.is_over:

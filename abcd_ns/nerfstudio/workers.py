@@ -14,7 +14,7 @@ from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.errors import UserError
 from abcd_ns.machine import threads_wanted
-from abcd_ns.run.workers import BLOCKS_EACH, works_at_once
+from abcd_ns.run.fit import BLOCKS_EACH, works_at_once
 
 
 def check_workers(config: TrainerConfig) -> None:

@@ -33,7 +33,7 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.coarse_model import split_by_block
-from abcd_ns.engine.train.density.clock import DensityClock
+from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step

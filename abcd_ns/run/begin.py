@@ -15,9 +15,8 @@ from abcd_ns.cluster.assignment import Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
@@ -27,7 +26,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_at_rest
-from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, coarse_model_size
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
@@ -43,13 +42,14 @@ from abcd_ns.run.fit import (
     Demand,
     Fit,
     RamShares,
+    blocks_to_begin_with,
     device_budget,
     find_fit,
     fit_gaussians,
+    number_of_workers,
 )
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
-from abcd_ns.run.workers import blocks_to_begin_with, number_of_workers
 
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
 """Starts workers on GPUs or other machines. Takes what they have in common, their number, and the bytes of
@@ -186,14 +186,14 @@ class RunBuilder:
         options, blocks = self.options, run.scene.tree.num_blocks
         layers = self.ram.layers  # on the CPU, RAM is the device
         room = LayerRoom(layers) if self._on_cpu else LayerRoom(int(LAYER_SHARE * self.device_bytes), layers)
-        source, target = LayerSource(run, room), self.capture.target
+        target = self.capture.target
         # Where RAM is short, one process: each reads blocks for itself.
         wanted = options.workers or int(options.ram_budget_gb > 0)
         count = number_of_workers(wanted, blocks, run.config, self.device)
         if blocks > 1 and (count > 1 or options.cluster is not None):
             workers, lag = self._workers(run, count, room)
-            return Dispatcher(run, workers, lag, source, target)
-        return Coordinator(run, source=source, target=target)
+            return Dispatcher(run, workers, lag, room, target)
+        return Coordinator(run, room=room, target=target)
 
     def _workers(self, run: TrainingRun, count: int, room: LayerRoom) -> tuple[Workers, int | None]:
         """Forked on the cores of this machine, else remote ones; and the dispatcher's lag.

@@ -1,4 +1,4 @@
-"""What fits this machine: how many blocks, how much of a photo a step draws, and what is kept in RAM."""
+"""What fits this machine: blocks, workers, how much of a photo a step draws, and what is kept in RAM."""
 
 import math
 from bisect import bisect_left
@@ -7,12 +7,15 @@ from dataclasses import dataclass, replace
 import psutil
 import torch
 
+from abcd_ns.cluster.forked_workers import can_fork
 from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
+from abcd_ns.machine import threads_wanted
 from abcd_ns.units import GIB, bytes_in_words
 
 EXPECTED_GROWTH = 5
@@ -40,6 +43,8 @@ COARSE_MODEL = "scaffold_gaussians"
 BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64
 """No larger factor is proposed."""
+BLOCKS_EACH = 2
+"""Blocks for each worker at least, where their number is not given: one in training, one that rests."""
 
 
 @dataclass(frozen=True)
@@ -244,6 +249,43 @@ def _least_budget(budget: int, demand: Demand) -> float:
     while _fit(high * step, demand) is None:
         high *= 2
     return bisect_left(range(high), True, low, key=lambda n: _fit(n * step, demand) is not None) / 100
+
+
+def blocks_to_begin_with(fit: Fit, workers: int) -> int:
+    """As few as fit the device, but enough for every worker.
+
+    Args:
+        workers: 0 for none, also where one process trains.
+
+    Raises:
+        UserError: they need several blocks, and there is no room for the layers around one.
+    """
+    if workers and not fit.limit:
+        raise UserError(
+            f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
+            "workers need: train without workers, or on smaller photos."
+        )
+    return max(fit.blocks, BLOCKS_EACH * workers)
+
+
+def works_at_once(recipe: Recipe) -> bool:
+    """Whether a method can train several blocks at once."""
+    return not recipe.exact and recipe.overlap == 0
+
+
+def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device | str) -> int:
+    """`RunOptions.workers`, its 0 resolved.
+
+    Args:
+        blocks: of the scene.
+    """
+    if asked:
+        return asked
+    # Workers learn nothing of light and poses: two of them may show one photo.
+    learns = training.light != "none" or training.poses != "off"
+    if learns or not works_at_once(training.recipe) or not can_fork(torch.device(device)):
+        return 1
+    return max(min(threads_wanted(), blocks // BLOCKS_EACH), 1)
 
 
 @dataclass(frozen=True)

@@ -67,9 +67,8 @@ class MadeFor:
     def differences(self, store: ParameterStore) -> str:
         """What `store` was made for that is otherwise here, in words; empty where nothing is."""
         theirs, mine = store.header.get(MADE_FOR), asdict(self)
-        if theirs is None:  # made before this was written down
+        if theirs is None:  # nothing was written down
             return ""
-        theirs = {"primitive": "3dgs"} | theirs  # nothing else there was
         different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
         return "; ".join(
             f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different

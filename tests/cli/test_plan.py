@@ -15,8 +15,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
-from abcd_ns.run.fit import FITTED, Fit
-from abcd_ns.run.workers import blocks_to_begin_with
+from abcd_ns.run.fit import FITTED, Fit, blocks_to_begin_with
 from abcd_ns.units import GIB
 from tests.cli.check.scenes import wide
 from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos

@@ -87,7 +87,10 @@ def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, dat
         assert_same(resumed.base_dir, undisturbed)
 
 
-@pytest.mark.parametrize("point", crash_points.TRAINER)
+@pytest.mark.parametrize(
+    "point",
+    [crash_points.CHECKPOINT_PINNED, crash_points.CHECKPOINT_WRITTEN, crash_points.CHECKPOINT_IN_PLACE],
+)
 def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbed, tmp_path, point):
     assert trainings.finish(data, tmp_path / "killed", kill=Kill(point, 2)) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")

@@ -9,8 +9,7 @@ from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_under_t
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.train.density.control import DensityClock, DensityControl
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, final_decay, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View

@@ -23,7 +23,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
@@ -132,8 +132,8 @@ def make_coordinator(
         *nothing_live(gaussians.sh_degree, device),
         device=device,
     )
-    source = LayerSource(run, LayerRoom(layer_bytes, layer_ram_bytes))
-    coordinator = kind(run) if kind else Coordinator(run, source=source, target=target)
+    room = LayerRoom(layer_bytes, layer_ram_bytes)
+    coordinator = kind(run) if kind else Coordinator(run, room=room, target=target)
     if resume:
         coordinator.restore()
     return coordinator

@@ -26,8 +26,7 @@ from abcd_ns.cli.plan.forecast import (
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
-from abcd_ns.engine.gaussians.thin_points import thin_points
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
@@ -37,8 +36,7 @@ from abcd_ns.lab.runs.options import Number, check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
-from abcd_ns.run.fit import Demand, Fit, device_budget, find_fit
-from abcd_ns.run.workers import blocks_to_begin_with
+from abcd_ns.run.fit import Demand, Fit, blocks_to_begin_with, device_budget, find_fit
 from abcd_ns.units import bytes_in_words
 
 

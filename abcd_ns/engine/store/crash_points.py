@@ -25,20 +25,6 @@ CHECKPOINT_WRITTEN = "checkpoint written"
 CHECKPOINT_IN_PLACE = "checkpoint in place"
 """It is there; older checkpoints and their pins are, too."""
 
-ENGINE = (
-    FILE_WRITTEN,
-    FILE_SYNCED,
-    FILE_IN_PLACE,
-    SHARDS_IN_PLACE,
-    GENERATION_PUBLISHED,
-    SHARD_DELETED,
-    SHARDS_LINKED,
-    VISIT_TRAINED,
-)
-"""Those that a run of the engine reaches."""
-TRAINER = (CHECKPOINT_PINNED, CHECKPOINT_WRITTEN, CHECKPOINT_IN_PLACE)
-"""Those of nerfstudio's checkpoints."""
-
 
 def _go_on(point: str) -> None:
     """What a run does at every point."""

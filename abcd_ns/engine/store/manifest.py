@@ -79,15 +79,6 @@ class Manifest:
         # Comparing bytes finds alterations, too, that JSON reads as the same value.
         if _in_envelope(_compact(body)) != data:
             raise StoreError(f"{path} is damaged: its checksum is wrong. Restore it from a pin or a copy.")
-        return Manifest._of(body)
-
-    @staticmethod
-    def written(data: bytes) -> "Manifest":
-        """The manifest that was just written as `data`: shares nothing with the one that it was made from."""
-        return Manifest._of(json.loads(data)["body"])
-
-    @staticmethod
-    def _of(body: dict[str, Any]) -> "Manifest":
         blocks = {from_text(block): Shard(**shard) for block, shard in body["blocks"].items()}
         return Manifest(body["generation"], body["header"], body["state"], blocks)
 

@@ -53,14 +53,14 @@ class ParameterStore:
             FolderLockedError: another writer has it.
         """
         folder = Path(folder)
-        data = Manifest(0, header, {}, {}).to_bytes()
+        data, path = Manifest(0, header, {}, {}).to_bytes(), manifest_path(folder)
         lock = _claim(folder)
         try:
-            write_file(manifest_path(folder), data)
+            write_file(path, data)
         except OSError as error:
             lock.release()
             raise StoreError(f"No store can be made in {folder}: {error.strerror}.") from error
-        return cls(folder, Manifest.written(data), lock)
+        return cls(folder, Manifest.from_bytes(data, path), lock)
 
     @classmethod
     def open(
@@ -319,9 +319,9 @@ class ParameterStore:
 
     def _publish(self, manifest: Manifest) -> None:
         """Make `manifest` the present one, on disk and here. Its shards must be on disk."""
-        data = manifest.to_bytes()
-        write_file(manifest_path(self.folder), data)
-        self._manifest = Manifest.written(data)
+        data, path = manifest.to_bytes(), manifest_path(self.folder)
+        write_file(path, data)
+        self._manifest = Manifest.from_bytes(data, path)  # shares nothing with what the caller holds
         crash_points.reached(crash_points.GENERATION_PUBLISHED)
 
     @contextmanager

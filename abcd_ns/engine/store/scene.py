@@ -213,7 +213,6 @@ class StoredScene(VisitScene):
             self.store.close()
 
     def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
-        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
         self._live = (block, live)
 
     def clear_live(self) -> None:
@@ -236,7 +235,6 @@ class StoredScene(VisitScene):
         return name in self._unsaved or name in self.store.blocks
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians at rest under a name, the pending migrants of a block left out; nothing is read."""
         block = self._unsaved.get(name)
         return self.store.counts(name) if block is None else block.rows
 
@@ -249,7 +247,6 @@ class StoredScene(VisitScene):
         return self.store.meta(name) if block is None else block.meta
 
     def pending_for(self, block: int) -> BlockState | None:
-        """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
         return self._pending_by_block.get(block)
 
     def state(self, name: BlockName) -> BlockState:
@@ -310,7 +307,6 @@ class StoredScene(VisitScene):
         return Gaussians.cat([found, _picked(migrants.gaussians, which).to(device)])
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
-        """The block as a visit will find it, whatever is live."""
         stored, migrants = self.stored(block), self.pending_for(block)
         return stored if migrants is None else Gaussians.cat([stored, migrants.gaussians])
 

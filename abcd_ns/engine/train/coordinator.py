@@ -1,7 +1,7 @@
 """Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
 
-The coordinator is made of what gives it blocks (`Visits`), layers (`LayerSource`) and gradients
-(`VisitTraining`). What is not live lies at rest in the store; listeners are told what happens.
+`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not live lies at rest in
+the store; listeners are told what happens.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,11 +18,10 @@ from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.commit import commit
 from abcd_ns.engine.store.special_blocks import LIVE, BlockName
 from abcd_ns.engine.train.density.splitting import cut_full
-from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.active_block import ActiveBlock
 from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered, Sample, Target
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
@@ -40,22 +39,20 @@ class Coordinator(Trainer):
 
     Args:
         visits: decides which; None for ABCD's own.
-        source: gives visits their layers; None for the run's scene, and little room.
+        room: for layers; None for little, on the device.
         target: gives what a sample is trained on; needed where poses are refined, and for a final pruning.
-        live: the block in training; None for one that nobody else looks after.
     """
 
     def __init__(
         self,
         run: TrainingRun,
         visits: Visits | None = None,
-        source: LayerSource | None = None,
+        room: LayerRoom | None = None,
         target: Callable[[Sample], Target] | None = None,
-        live: ActiveBlock | None = None,
     ) -> None:
         super().__init__(run)
-        self.visits, self.source = visits or Planner(run), source or LayerSource(run)
-        self.visit = VisitTraining(run, self.visits, self.source, live)
+        self.visits, self.room = visits or Planner(run), room or LayerRoom()
+        self.visit = VisitTraining(run, self.visits, self.room)
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
@@ -168,7 +165,7 @@ class Coordinator(Trainer):
     @property
     def layer_limit(self) -> int:
         """Bytes that layers may take, on the device and in RAM."""
-        return self.source.room.total
+        return self.room.total
 
     @property
     def layer_bytes(self) -> int:
@@ -181,7 +178,7 @@ class Coordinator(Trainer):
         if (active := self.state.active) is not None:
             self.health.look_over()
             self.scene.make_room()
-            updates = {LIVE: self.visit.live.detached().unpinned()}
+            updates = {LIVE: self.visit.live.detached()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()

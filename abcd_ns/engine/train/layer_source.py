@@ -1,6 +1,6 @@
 """Where a visit's layers come from: the frozen blocks, drawn around the one that is to be trained."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from abcd_ns.engine.events import LayersDrawn
@@ -33,39 +33,28 @@ class LayerRoom:
         return first, LayerRoom(self.device - first.device, self.ram - first.ram)
 
 
-class LayerSource:
-    """Draws what is frozen around a block.
-
-    Args:
-        around: gives the scene that neighbours are drawn from; None for the run's own, as it is by then.
-    """
-
-    def __init__(
-        self, run: TrainingRun, room: LayerRoom | None = None, around: Callable[[], BlockScene] | None = None
-    ) -> None:
-        self._run, self.room = run, room or LayerRoom()
-        self._around = around or (lambda: run.scene)
-
-    def draw(self, active: ActiveVisit, views: Iterable[int]) -> VisitLayers | None:
-        """F and B of these views, or None where nothing is around the block; listeners hear of each."""
-        run, config = self._run, self._run.config
-        if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
-            return None
-        painted = list(run.views.values())
-        layers = VisitLayers(
-            renderer_of(run, self._around(), painted),
-            LayerStore(run.device, self.room.device, self.room.ram),
-            active.geometry,
-            run.scene.gaussians_at_rest(active.geometry.block),
-            run.views,
-            RenderSettings(active.sh_degree, config.antialiased),
-            window_weight=config.recipe.window_weight,
-            parts_bytes=parts_bytes(run, painted, blocks=2),
-        )
-        wanted = dict.fromkeys(views)
-        for done, _ in enumerate(layers.draw(wanted), start=1):
-            run.announce(LayersDrawn(active.number, done, len(wanted)))
-        return layers
+def layers_of_visit(
+    run: TrainingRun, room: LayerRoom, active: ActiveVisit, views: Iterable[int]
+) -> VisitLayers | None:
+    """F and B of these views, or None where nothing is around the block; listeners hear of each."""
+    config = run.config
+    if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
+        return None
+    painted = list(run.views.values())
+    layers = VisitLayers(
+        renderer_of(run, run.scene, painted),
+        LayerStore(run.device, room.device, room.ram),
+        active.geometry,
+        run.scene.gaussians_at_rest(active.geometry.block),
+        run.views,
+        RenderSettings(active.sh_degree, config.antialiased),
+        window_weight=config.recipe.window_weight,
+        parts_bytes=parts_bytes(run, painted, blocks=2),
+    )
+    wanted = dict.fromkeys(views)
+    for done, _ in enumerate(layers.draw(wanted), start=1):
+        run.announce(LayersDrawn(active.number, done, len(wanted)))
+    return layers
 
 
 def renderer_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> LayerRenderer:

@@ -14,10 +14,10 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, gradients_of
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.health.health_rules import share_of_picture
-from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -36,10 +36,10 @@ from abcd_ns.engine.train.step.batch import (
     Batch,
     Pictures,
     Rendered,
+    Residuals,
     Sample,
     part_to_draw,
 )
-from abcd_ns.engine.train.step.residuals import Residuals
 from abcd_ns.engine.types import Crop, View
 
 
@@ -48,19 +48,12 @@ class VisitTraining:
 
     Args:
         visits: on what terms the block is trained.
-        source: gives visits their layers.
-        live: the block in training; None for one that nobody else looks after.
+        room: for layers.
     """
 
-    def __init__(
-        self,
-        run: TrainingRun,
-        visits: Visits,
-        source: LayerSource,
-        live: ActiveBlock | None = None,
-    ) -> None:
-        self.run, self._visits, self._source = run, visits, source
-        self.live = ActiveBlock(run) if live is None else live  # one that is empty yet is false
+    def __init__(self, run: TrainingRun, visits: Visits, room: LayerRoom) -> None:
+        self.run, self._visits, self._room = run, visits, room
+        self.live = ActiveBlock(run)
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
@@ -96,7 +89,7 @@ class VisitTraining:
         # None where nobody knows how many steps it will have, and its views are drawn in turn.
         taken = 0 if active.is_alone else active.steps * self.batch
         self._order = view_order(active.views, taken, active.number, run.config.seed)
-        self.layers = self._source.draw(active, self._order[active.done * self.batch :])
+        self.layers = layers_of_visit(run, self._room, active, self._order[active.done * self.batch :])
         active.layer_seconds += run.stopwatch.seconds - before
         if active.done == 0 and active.looked_at:
             state.influence[block].update(self._shown_in(active.looked_at))
@@ -147,11 +140,6 @@ class VisitTraining:
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
 
-    @property
-    def _asks(self) -> bool:
-        run = self.run
-        return run.density.asks(run.share, self.live.clocks.visits == 0)
-
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
 
@@ -192,7 +180,9 @@ class VisitTraining:
             return
         damping = exponential_decay(run.progress, LAST_RATE)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
-        run.light.step(gradients_of(rendered.lights), share * damping)
+        lights = zip(rendered.views, rendered.lights, strict=True)
+        gradients = [(view.index, light.grad) for view, light in lights if light.grad is not None]
+        run.light.step(gradients, share * damping)
 
     @property
     def is_over(self) -> bool:
@@ -217,7 +207,7 @@ class VisitTraining:
         self.live.shrink_oversized()
         if not active.is_whole:
             self.live.count_visit()
-        state = self.run.health.end_visit(active, self.live.detached)
+        state = self.run.health.end_visit(self.live.detached)
         self.layers = None
         return state
 
@@ -265,17 +255,12 @@ class VisitTraining:
             sh_degree=self.degree,
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
-            judge=self._asks,
+            judge=run.density.asks(run.share, first=self.live.clocks.visits == 0),
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
-        lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]
-        uses = [
-            (sample.view.index, transform)
-            for sample, transform in zip(samples, lights, strict=True)
-            if transform is not None
-        ]
-        pictures = self._pictures(samples, rasters, lights)
-        return Rendered(pictures, rasters, infos, uses, tuple(sample.view for sample in samples))
+        views = tuple(sample.view for sample in samples)
+        lights = tuple(None if run.light is None else run.light.of(view.index) for view in views)
+        return Rendered(self._pictures(samples, rasters, lights), rasters, infos, lights, views)
 
     def _pictures(
         self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]

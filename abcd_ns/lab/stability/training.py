@@ -15,8 +15,12 @@ from abcd_ns.engine.layers.fog import fog_in_white
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import (
+    LEAST_REFINEMENTS,
+    DensityClock,
+    DensityConfig,
+    DensityControl,
+)
 from abcd_ns.engine.train.health.health_rules import OVERSIZED_ANGLE
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step

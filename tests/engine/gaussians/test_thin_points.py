@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.gaussians.thin_points import finest_pixel, thin_points
+from abcd_ns.engine.gaussians.initialize import finest_pixel, thin_points
 from tests.reference.scenes import ring_of_views
 
 VIEWS = ring_of_views(6)

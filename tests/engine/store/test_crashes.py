@@ -73,4 +73,6 @@ def test_a_run_that_the_disk_refuses_goes_on_when_there_is_room(runs, undisturbe
 def test_a_run_reaches_every_point_at_which_it_can_be_killed(tmp_path):
     begun = points_reached(tmp_path)
     resumed = points_reached(tmp_path)
-    assert set(begun) | set(resumed) == set(crash_points.ENGINE)
+    points = {point for name, point in vars(crash_points).items() if name.isupper()}
+    of_checkpoints = {point for point in points if point.startswith("checkpoint")}
+    assert set(begun) | set(resumed) == points - of_checkpoints != points

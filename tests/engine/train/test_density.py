@@ -4,14 +4,14 @@ import math
 
 import pytest
 import torch
+from gsplat.strategy import MCMCStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density import control as control_module
-from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
+from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.train.density.relocation import compute_relocation
 from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture
 from abcd_ns.engine.train.health.health_rules import OVERSIZED_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -19,6 +19,7 @@ from abcd_ns.errors import UserError
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 VIEWS = 5
+BINOMIALS = MCMCStrategy().initialize_state()["binoms"]
 
 
 def live(gaussians: Gaussians):
@@ -160,7 +161,7 @@ def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
 @pytest.mark.parametrize("copies", [1, 2, 5])
 def test_relocated_copies_have_together_the_opacity_of_the_original(copies):
     opacities, scales = torch.tensor([0.7]), torch.tensor([[0.3, 0.2, 0.1]])
-    new, _ = compute_relocation(opacities, scales, torch.tensor([copies]), binomials())
+    new, _ = compute_relocation(opacities, scales, torch.tensor([copies]), BINOMIALS)
     assert float((1 - new) ** copies) == pytest.approx(0.3, abs=1e-6)
 
 
@@ -168,7 +169,7 @@ def test_relocation_keeps_the_mass_along_a_ray():
     """Equation 9 equates the integrals over a line through the centre; here by quadrature."""
     opacity, sigma, copies = 0.7, 0.3, 3
     new, scale = compute_relocation(
-        torch.tensor([opacity]), torch.full((1, 3), sigma), torch.tensor([copies]), binomials()
+        torch.tensor([opacity]), torch.full((1, 3), sigma), torch.tensor([copies]), BINOMIALS
     )
     x = torch.linspace(-6, 6, 20001, dtype=torch.float64)
 

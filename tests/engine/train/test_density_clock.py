@@ -6,8 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import (
+    LEAST_REFINEMENTS,
+    DensityClock,
+    DensityConfig,
+    DensityControl,
+)
 
 
 def clock(**changes) -> DensityClock:

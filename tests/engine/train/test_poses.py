@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.train.capture.poses import laid_over, turned
+from abcd_ns.engine.train.layer_source import layers_of_visit
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.errors import UserError
@@ -153,7 +154,7 @@ def test_poses_stay_through_a_visit_and_its_layers_show_them(make, photos):
             assert torch.equal(poses_of(made.run), seen[-1])
             layers, view = made.visit.layers, made.state.active.views[0]
             kept = layers.around(view)[0].front
-            fresh = made.source.draw(made.state.active, [view]).around(view)[0].front
+            fresh = layers_of_visit(made.run, made.room, made.state.active, [view]).around(view)[0].front
             assert torch.equal(kept.color, fresh.color)
     assert sum(not torch.equal(a, b) for a, b in pairwise(seen)) > 1
 

@@ -18,8 +18,6 @@ from abcd_ns.errors import UserError
 Kind = Literal["none", "exposure", "affine"]
 Gradients = Sequence[tuple[int, Tensor]]
 """(view, the gradient by its transform) pairs, one for each picture."""
-Use = tuple[int, Tensor]
-"""(view, its transform), of a picture that was drawn in its photo's light."""
 RATE, DECAY_USES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
 LAST_RATE = 0.03
@@ -151,11 +149,6 @@ class HeldLight:
 
     def step(self, gradients: Gradients, damping: float = 1.0) -> None:
         """Nothing."""
-
-
-def gradients_of(uses: Sequence[Use]) -> Gradients:
-    """What a step's backward pass has left in the transforms of its pictures."""
-    return [(view, transform.grad) for view, transform in uses if transform.grad is not None]
 
 
 def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:

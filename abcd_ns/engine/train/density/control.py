@@ -19,7 +19,6 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
-from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.train.density.pruning import (
     FAINT,
@@ -30,7 +29,7 @@ from abcd_ns.engine.train.density.pruning import (
     have_contributions,
     risen,
 )
-from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
+from abcd_ns.engine.train.density.relocation import compute_relocation
 from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, worth
 
 GATHER, REFINE = 1, 6
@@ -87,11 +86,48 @@ class DensityConfig:
         return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
 
 
+@dataclass(frozen=True)
+class DensityClock:
+    """Where the run and the active block stand; all that decides whether to refine."""
+
+    progress: float
+    """Share of the run that is done: 0..1."""
+    steps: int
+    """Views that were drawn to train the block so far, this step's included."""
+    taken: int
+    """This step's."""
+    views: int
+    """Views that the block is trained on."""
+    room: int | None
+    """Gaussians that may still be added to the scene; None for no limit."""
+    seed: int
+    """Of the random numbers drawn in this step."""
+    refined: int = 0
+    """`steps` when the block was last refined."""
+    first: bool = False
+    """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
+    spent: float = 0.0
+    """Share of the visit that is done; 0 in the warm-up and where there are no other blocks."""
+    visit: int | None = None
+    """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
+    show it."""
+
+    @property
+    def pace(self) -> float:
+        """Views that the whole run would draw, if it went on as it has so far."""
+        return self.steps / max(self.progress, 1e-9)
+
+    def reached(self, every: int) -> bool:
+        """Whether `steps` has come to a multiple of `every` in this step."""
+        return self.steps // every > (self.steps - self.taken) // every
+
+
 class DensityControl:
     """Applies the configured strategy to the live block."""
 
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
-        self.config, self._axes, self._binomials = config, primitive.axes, binomials()
+        self.config, self._axes = config, primitive.axes
+        self._state = MCMCStrategy().initialize_state() if config.strategy == "mcmc" else {}
 
     @property
     def wants_weights(self) -> bool:
@@ -100,8 +136,6 @@ class DensityControl:
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
         """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
-        if self.config.strategy != "mcmc":
-            return params["means"].new_zeros(())
         opacity = torch.sigmoid(params["opacities"]).sum()
         scale = torch.exp(params["scales"]).sum() / 3
         return (MCMC_OPACITY_REG * opacity + MCMC_SCALE_REG * scale) / max(scene_gaussians, 1)
@@ -231,10 +265,7 @@ class DensityControl:
         alive = self.is_due(clock) and bool((params["opacities"].sigmoid() > MCMC_MIN_OPACITY).any())
         step = REFINE if alive else GATHER
         learning_rate = optimizers["means"].param_groups[0]["lr"]
-        self._binomials = self._binomials.to(params["means"].device)
-        strategy.step_post_backward(
-            params, optimizers, {"binoms": self._binomials}, step, {}, lr=learning_rate
-        )
+        strategy.step_post_backward(params, optimizers, self._state, step, {}, lr=learning_rate)
 
 
 def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -25,14 +25,14 @@ LEAST = 1e-6
 WEIGHT = BLEND_SUMS[0]
 
 
-def chosen(wanted: Float[Tensor, "n"], room: int | None) -> Bool[Tensor, "n"]:
+def chosen(wanted: Float[Tensor, "n"], room: int) -> Bool[Tensor, "n"]:
     """Which are to become two: all that want to, or as many of those that want to most as there is room for.
 
     Args:
         wanted: how much each wants to; 0 for not at all.
     """
     which = wanted > 0
-    if room is None or int(which.sum()) <= room:
+    if int(which.sum()) <= room:
         return which
     most = torch.zeros_like(which)
     most[wanted.topk(max(room, 0)).indices] = True

@@ -1,8 +1,5 @@
 """The relocation of 3DGS-MCMC in torch, for devices that gsplat's CUDA operator does not serve."""
 
-import math
-from functools import cache
-
 import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
@@ -36,9 +33,3 @@ def compute_relocation(
     denominator = (weights * new.double()[:, None] ** (k + 1)).sum(dim=1)
     factor = (flat.double() / denominator).to(scales.dtype)
     return new.reshape(opacities.shape), scales * factor[:, None]
-
-
-@cache
-def binomials(most: int = 51) -> Float[Tensor, "m m"]:
-    """C(i, k) for i, k < most; zero where k > i."""
-    return torch.tensor([[math.comb(i, k) for k in range(most)] for i in range(most)], dtype=torch.float32)

@@ -65,20 +65,13 @@ def with_full(
     pending = updates.get(PENDING)
     if not limits.block_limit or pending is None:
         return updates
-    waiting = split_by_block(pending, scene.tree.assign(pending.gaussians.means))
-    at_rest = {block: migrants for block, migrants in waiting.items() if block not in busy}
-    # A block whose visit has just ended may have pending migrants, too: what came while it was out.
-    rows = {block: len(updates[block]) if block in updates else scene.rows(block) for block in at_rest}
-    full = {
-        block: migrants
-        for block, migrants in at_rest.items()
-        if rows[block] + len(migrants) > FULL * limits.block_limit
-    }
-    joined = {
-        block: join([updates[block] if block in updates else scene.state(block), migrants])
-        for block, migrants in full.items()
-    }
-    return {**updates, **joined, PENDING: without(scene, pending, full)} if full else updates
+    joined: dict[BlockName, BlockState] = {}
+    for block, migrants in split_by_block(pending, scene.tree.assign(pending.gaussians.means)).items():
+        # A block whose visit has just ended may have pending migrants, too: what came while it was out.
+        rows = len(updates[block]) if block in updates else scene.rows(block)
+        if block not in busy and rows + len(migrants) > FULL * limits.block_limit:
+            joined[block] = join([updates[block] if block in updates else scene.state(block), migrants])
+    return {**updates, **joined, PENDING: without(scene, pending, joined)} if joined else updates
 
 
 def cut_full(

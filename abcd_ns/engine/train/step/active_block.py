@@ -9,8 +9,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
-from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import Infos
+from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.pruning import LAST, faded
 from abcd_ns.engine.train.density.splitting import is_full

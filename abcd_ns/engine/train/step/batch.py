@@ -15,8 +15,9 @@ from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.cuda.frame import Frame
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
-from abcd_ns.engine.train.capture.light import Use, lit
+from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, Layer, View
@@ -150,8 +151,8 @@ class Rendered:
     rasters: tuple[Raster | Layer, ...]
     """Of the active block and what was sorted in with it."""
     infos: tuple[dict[str, Any], ...]
-    lights: Sequence[Use] = ()
-    """What the pictures were drawn in."""
+    lights: Sequence[Tensor | None] = ()
+    """Transforms of the photos' light that the pictures were drawn in."""
     views: Sequence[View] = ()
     """That the pictures are of."""
 
@@ -159,6 +160,39 @@ class Rendered:
     def transmittances(self) -> tuple[Float[Tensor, "_h _w"], ...]:
         """Of the rasters."""
         return tuple(raster.transmittance for raster in self.rasters)
+
+
+class Residuals:
+    """What a step's pictures lack, summed up for each Gaussian by the backward pass: growth judges by it."""
+
+    def __init__(self) -> None:
+        self._asked: list[tuple[dict[str, Any], int, Sample, Tensor]] = []
+
+    @torch.no_grad()
+    def ask(
+        self, rendered: Rendered, samples: Sequence[Sample], pictures: Pictures, photos: Pictures
+    ) -> None:
+        """Before the backward pass.
+
+        Args:
+            rendered: of these samples.
+            pictures: what is compared with the photos.
+        """
+        compared = list(zip(samples, pictures, photos, strict=True))
+        for info in (info for info in rendered.infos if "sums" in info):
+            own = [
+                each for raster, each in zip(rendered.rasters, compared, strict=True) if raster.info is info
+            ]
+            info["sums"].ask([sample.residual(picture, photo) for sample, picture, photo in own])
+            for k, (sample, picture, photo) in enumerate(own):
+                error = (photo[..., :3] - picture).square().sum(dim=-1).mean()
+                self._asked.append((info, k, sample, error))
+
+    def found(self) -> list[Judged]:
+        """After it; then there are none. Nor are there any of a block of nobody."""
+        asked, self._asked = self._asked, []
+        known = ((info["sums"].values, *rest) for info, *rest in asked)
+        return [Judged(s.view, sums[k], error, s.share) for sums, k, s, error in known if sums is not None]
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:
