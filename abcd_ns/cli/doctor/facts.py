@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 from abcd_ns import __version__
-from abcd_ns.cli.train import find_ns_train
+from abcd_ns.cli.train import find_tool
 from abcd_ns.errors import IMPORT_TROUBLE, first_line
 from abcd_ns.machine import describe_machine, output_of, own_commit, package_version
 from abcd_ns.units import bytes_in_words
@@ -100,7 +100,7 @@ def gather() -> Facts:
         ray=package_version("ray"),
         broken=broken,
         registered="abcd" in {entry.name for entry in entry_points(group="nerfstudio.method_configs")},
-        has_ns_train=find_ns_train() is not None,
+        has_ns_train=find_tool("ns-train") is not None,
         os=f"{platform.system()} {platform.release()} {platform.machine()}",
         ram_bytes=memory.total,
         ram_free_bytes=memory.available,

@@ -54,7 +54,6 @@ class ProgressReport:
         self._coordinator, self._visits = coordinator, visits
         self._held_out: HeldOutScored | None = None
         self._psnr: float | None = None
-        self._epoch = 0
         self._visit: VisitBegan | None = None
         self._workers: tuple[WorkerSeen, ...] = ()
         self._last_line = self._last_look = time.monotonic()
@@ -64,7 +63,7 @@ class ProgressReport:
         """Take note of an event."""
         match event:
             case VisitBegan():
-                self._visit, self._epoch = event, event.sweep
+                self._visit = event
                 self._show("")
             case LayersDrawn():
                 self._show(f"layers {event.done}/{event.total}")
@@ -95,7 +94,7 @@ class ProgressReport:
         found = {
             "block": 0 if block is None else block + 1,
             "blocks": coordinator.scene.tree.num_blocks,
-            "sweep": self._epoch,
+            "sweep": coordinator.state.sweep,
             "gaussians": coordinator.count(),
             "share of time for layers": layer_share(self._visits),
             "RAM (GiB)": psutil.Process().memory_info().rss / GIB,
