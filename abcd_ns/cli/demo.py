@@ -2,7 +2,6 @@
 
 import math
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from rich.console import Console
 
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.terminal import print_facts, print_plain
+from abcd_ns.cli.train import find_tool
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.runner import take_folder, taking
 from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine
@@ -97,10 +97,12 @@ def _run(command: Sequence[str], logs: Path, console: Console) -> None:
     print_plain(f"$ {' '.join(command)}", console, style="dim")
     program, *words = command
     name = words[0] if program == "abcd" else program
-    log, shown = logs / f"{name}.log", program == "ns-train"
+    log, shown, tool = logs / f"{name}.log", program == "ns-train", find_tool(program)
+    if tool is None:
+        raise UserError(f"There is no {program} here; install nerfstudio into this environment.")
     with open(log, "wb") as file:
         output = {} if shown else {"stdout": file, "stderr": subprocess.STDOUT}
-        done = subprocess.run([_tool(program), *words], stdin=subprocess.DEVNULL, check=False, **output)
+        done = subprocess.run([tool, *words], stdin=subprocess.DEVNULL, check=False, **output)
     if done.returncode != 0:
         where = "its output above" if shown else log
         raise UserError(f"{name} failed with exit code {done.returncode}; see {where}.")
@@ -129,11 +131,3 @@ def _sum_up(out: Path, run: Path, seconds: float, taken: float, console: Console
     }
     lines = (f"  {command}\n      {what}" for command, what in steps.items())
     print_plain("\n".join(["\nNext:", *lines]), console)
-
-
-def _tool(name: str) -> str:
-    """The command that lies beside this Python."""
-    path = Path(sys.executable).with_name(name)
-    if not path.exists():
-        raise UserError(f"{path} is missing; install nerfstudio into the environment of this command.")
-    return str(path)

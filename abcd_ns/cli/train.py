@@ -36,7 +36,7 @@ def train(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(USAGE)
         return 0
-    ns_train = find_ns_train()
+    ns_train = find_tool("ns-train")
     if ns_train is None:
         raise UserError("There is no ns-train here; install nerfstudio into this environment.")
     command = [ns_train, *command_line(Path(words[0])), *words[1:]]
@@ -66,7 +66,7 @@ def _flags(table: Mapping[str, Any], prefix: str, path: Path) -> Iterator[str]:
             raise UserError(f"{path}: {name} is a list or a date; an option has a single value.")
 
 
-def find_ns_train() -> str | None:
-    """The command beside this Python, or else on the PATH."""
-    beside = Path(sys.executable).with_name("ns-train")
-    return str(beside) if beside.exists() else shutil.which("ns-train")
+def find_tool(name: str) -> str | None:
+    """The command of this name beside this Python, or else on the PATH."""
+    beside = Path(sys.executable).with_name(name)
+    return str(beside) if beside.exists() else shutil.which(name)

@@ -228,11 +228,8 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
     Raises:
         UserError: an option of splatfacto was set that ABCD does not use.
     """
-    for name in HIDDEN:
-        if name in {*MIRRORED, *TOLERATED} or getattr(model, name) == _default(type(model), name):
-            continue
-        why = UNUSED_OF_MODEL.get(name, "it is splatfacto's; `ns-train abcd --help` has ABCD's")
-        raise UserError(_no_effect(f"pipeline.model.{name}", why))
+    unused = {name: why for name, why in UNUSED_OF_MODEL.items() if name not in TOLERATED}
+    refuse_changed(model, unused, "pipeline.model.")
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
     if training.light != "none":  # held-out photos have a light of their own, too

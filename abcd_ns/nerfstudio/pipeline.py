@@ -91,7 +91,7 @@ class AbcdPipeline(VanillaPipeline):
         report = ProgressReport(self.coordinator, log.visits)
         self.coordinator.announce.subscribe(report)
         self.coordinator.announce.subscribe(log)
-        self.panel.follow(self.coordinator)
+        self.panel.follow(self.coordinator, log)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:

@@ -27,10 +27,9 @@ from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_c
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
-from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
-from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume, next_steps
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.fit import Demand, device_budget, find_fit
 from abcd_ns.run.store import Start

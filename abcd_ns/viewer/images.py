@@ -14,6 +14,8 @@ from PIL import Image
 
 WIDTH = 260
 """Of the panel, px."""
+MOST_POINTS = 400
+"""Of a curve; of more, an evenly spaced choice is drawn."""
 LINE, GRID, TEXT = "#ffd369", "#3a3f4b", "#c1c2c5"
 
 
@@ -30,13 +32,14 @@ def curve_image(points: Sequence[tuple[float, float]], name: str) -> str:
 
     figure = Figure(figsize=(WIDTH / 96, WIDTH / 192), layout="constrained")  # at 96 px an inch
     axes = figure.add_subplot(facecolor="none")
-    axes.plot(*zip(*points, strict=True), color=LINE, linewidth=1)
+    shown = points[:: -(-len(points) // MOST_POINTS)]
+    axes.plot(*zip(*shown, strict=True), color=LINE, linewidth=1)
     axes.tick_params(labelsize=6, labelcolor=TEXT, color=GRID)
     axes.grid(color=GRID)
     axes.spines[:].set_visible(False)
     with matplotlib.rc_context({"svg.fonttype": "none"}):  # text stays text: a few KiB
         figure.savefig(svg := io.BytesIO(), format="svg", transparent=True)
-    return _image(svg, name, "svg+xml")
+    return f"![{name}]({data_uri(svg, 'svg+xml')})"
 
 
 def photo_image(photo: UInt8[np.ndarray, "h w c"], name: str) -> str:
@@ -44,8 +47,9 @@ def photo_image(photo: UInt8[np.ndarray, "h w c"], name: str) -> str:
     image = Image.fromarray(photo[..., :3])
     image.thumbnail((2 * WIDTH, 2 * WIDTH))  # sharp on screens of high resolution
     image.save(jpeg := io.BytesIO(), format="JPEG")
-    return _image(jpeg, name, "jpeg")
+    return f"![{name}]({data_uri(jpeg, 'jpeg')})"
 
 
-def _image(file: io.BytesIO, name: str, kind: str) -> str:
-    return f"![{name}](data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()})"
+def data_uri(file: io.BytesIO, kind: str) -> str:
+    """An image that stands in a page itself."""
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -22,12 +22,11 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
-from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.controls import CURVE, Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
-from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, time_left
-from abcd_ns.viewer.scenery import Scenery, first_look, nearest_view, views_that_see
+from abcd_ns.viewer.scenery import Scenery, boxes_of, bulk, first_look, nearest_view, views_that_see
+from abcd_ns.viewer.status import BlockRow, Status, status_of, time_left
 from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
 
 AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
@@ -59,7 +58,7 @@ class AbcdPanel(ViewerControl):
     ) -> None:
         self._model, self._views, self._photo = model, views, photo
         self._coordinator: Trainer | None = None
-        self._history = RunHistory()
+        self._log: Any = None
         self._controls: Controls | None = None
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
@@ -93,10 +92,13 @@ class AbcdPanel(ViewerControl):
             self._lay_out()
             self._update()
 
-    def follow(self, coordinator: Trainer) -> None:
-        """From now on show how this run goes."""
-        self._coordinator = coordinator
-        self._history = RunHistory.resumed(coordinator.state)
+    def follow(self, coordinator: Trainer, log: Any) -> None:
+        """From now on show how this run goes.
+
+        Args:
+            log: a RunLog: its `visits` and `curve` are read.
+        """
+        self._coordinator, self._log = coordinator, log
         if self._controls is not None:
             self._lay_out()
             coordinator.announce.subscribe(self)
@@ -104,7 +106,6 @@ class AbcdPanel(ViewerControl):
 
     def __call__(self, event: Event) -> None:
         """Take an event in."""
-        self._history.note(event, self._seconds)
         self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
         names = {LayersDrawn: "layers", Pruning: "final pruning"}
         self._stage = f"{names[type(event)]} {event.done} of {event.total}" if type(event) in names else ""
@@ -153,7 +154,7 @@ class AbcdPanel(ViewerControl):
             self._report(self._coordinator)
 
     def _report(self, coordinator: Trainer) -> None:
-        history, state, seconds = self._history, coordinator.state, self._seconds
+        state = coordinator.state
         said = headline(self._where(state), coordinator.progress, time_left(coordinator))
         sweep = f"Sweep {state.sweep}: {len(state.queue)} visits are waiting" if state.queue else ""
         if over := coordinator.finished and not self._stage:
@@ -163,11 +164,9 @@ class AbcdPanel(ViewerControl):
         self._controls.write(headline=said, sweep=sweep)
         self._controls.progress(coordinator.progress)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
-        if coordinator.finished:
-            history.end(seconds)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
-            self._controls.write(curve=curve_image(history.curve, CURVE))
+            self._controls.write(curve=curve_image(self._log.curve, CURVE))
 
     def _where(self, state: RunState) -> str:
         active = state.active
@@ -190,10 +189,21 @@ class AbcdPanel(ViewerControl):
             return [BlockRow(b, state[scene.count(b) > 0], scene.count(b), None, None) for b in blocks]
         if self._coordinator.config.recipe.exact:
             return [BlockRow(b, Status.ACTIVE, None, None, None) for b in blocks]
-        active = self._coordinator.state.active
-        whole = active is not None and active.is_whole
-        counts = {block: None if whole else scene.count(block) for block in blocks}
-        return self._history.rows(counts, self._coordinator.state.views)
+        state, active = self._coordinator.state, self._active()
+        psnrs = {visit.block: visit.psnr for visit in self._log.visits}
+        counts = [None if state.active and state.active.is_whole else scene.count(b) for b in blocks]
+        return [
+            BlockRow(b, status_of(b, state, active), counts[b], psnrs.get(b), state.views.get(b))
+            for b in blocks
+        ]
+
+    def _active(self) -> list[int]:
+        """The blocks in training."""
+        state = self._coordinator.state
+        if state.active is not None:
+            return [] if state.active.is_whole else [state.active.geometry.block]
+        in_flight = {visit.geometry.block for visit in state.in_flight}
+        return [worker.block for worker in self._workers if worker.block in in_flight]
 
     def _memory(self) -> list[tuple[str, int, int]]:
         rows = [("RAM", psutil.Process().memory_info().rss, psutil.virtual_memory().total)]
@@ -203,10 +213,6 @@ class AbcdPanel(ViewerControl):
         if self._coordinator is not None:
             rows.append(("layers", self._coordinator.layer_bytes, self._coordinator.layer_limit))
         return rows
-
-    @property
-    def _seconds(self) -> float:
-        return 0.0 if self._coordinator is None else self._coordinator.stopwatch.seconds
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Let a browser begin where the scene is to be seen."""
@@ -239,8 +245,9 @@ class AbcdPanel(ViewerControl):
             self._controls.write(photo=f"{photo_image(self._photo(view.index).numpy(), name)}  \n{name}")
 
     def _chosen_block(self) -> int | None:
-        visit = next(iter(self._history.under_way.values()), None)
-        return visit.block if self._controls.block is None and visit is not None else self._controls.block
+        if self._controls.block is not None or self._coordinator is None:
+            return self._controls.block
+        return next(iter(self._active()), None)
 
     def _show_cameras(self) -> None:
         block = self._chosen_block() if self._controls.cameras.value else None

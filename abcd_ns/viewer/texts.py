@@ -9,7 +9,7 @@ from pathlib import Path
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.guard.rules import THIS_MACHINE
-from abcd_ns.viewer.run_history import BlockRow, Status
+from abcd_ns.viewer.status import BlockRow, Status
 
 MOST_ROWS = 24
 """Of the table of blocks; with more blocks those that are active or under-observed come first."""

@@ -70,7 +70,7 @@ class StandIns:
 @pytest.fixture
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
-    monkeypatch.setattr(demo_module, "_tool", lambda name: str(stand_ins.folder / name))
+    monkeypatch.setattr(demo_module, "find_tool", lambda name: str(stand_ins.folder / name))
     return stand_ins
 
 

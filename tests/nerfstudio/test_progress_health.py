@@ -12,8 +12,8 @@ from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, V
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.nerfstudio.run import progress
-from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.progress import ProgressReport
+from abcd_ns.nerfstudio.run.stopping import next_steps
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 

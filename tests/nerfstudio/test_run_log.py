@@ -230,3 +230,5 @@ def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_numb
     samples = [line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
     assert [line["psnr"] for line in samples] == [15.0, None, None]
     assert samples[0]["held"] == {"photos": 7}
+    again = RunLog(coordinator, tmp_path / "again.jsonl", earlier=tmp_path / "log.jsonl")
+    assert log.curve == again.curve == [(samples[0]["seconds"], 15.0)]

@@ -9,8 +9,16 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, edges_of
-from abcd_ns.viewer.scenery import LIFT, first_look, nearest_view, views_that_see
+from abcd_ns.viewer.scenery import (
+    LIFT,
+    SCENE_SCALE,
+    boxes_of,
+    bulk,
+    edges_of,
+    first_look,
+    nearest_view,
+    views_that_see,
+)
 from tests.reference.scenes import ring_of_views
 
 

@@ -7,13 +7,11 @@ import numpy as np
 from abcd_ns.cli.check.survey import Look, Survey
 from abcd_ns.cli.findings import Finding, error, note, warning
 from abcd_ns.cli.terminal import few
+from abcd_ns.data import OPTION
 from abcd_ns.data.photos import default_budget
-from abcd_ns.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
 from abcd_ns.units import bytes_in_words
 
 FEW_PHOTOS, FEW_POINTS, FEW_POINTS_IN_VIEW = 8, 500, 20
-MANY_PIXELS = 4e6
-"""Of a photo. Scores of 3DGS are usually given for 1.6 million and less."""
 DARK, BRIGHT = 0.02, 0.98
 """Mean luma beyond which a photo shows nothing."""
 EXPOSURES = 3.0
@@ -27,8 +25,6 @@ FIELDS = 3.0
 """Ratio of angles of view beyond which one of them is doubtful."""
 UNSEEN = 0.05
 """Share of the points that may lie in no picture."""
-READER = DOWNSCALE.rpartition(".")[0]
-"""Begins the flags of `ns-train` that tell how the data is read."""
 
 
 def doubts(s: Survey) -> Iterator[Finding]:
@@ -36,7 +32,6 @@ def doubts(s: Survey) -> Iterator[Finding]:
     yield from _of_the_set(s)
     yield from _of_single_photos(s)
     yield from _of_cameras(s)
-    yield from _of_pictures(s)
     yield from _of_points(s)
 
 
@@ -47,15 +42,14 @@ def _named(names: Iterable[str]) -> tuple[int, str]:
 
 
 def _of_the_set(s: Survey) -> Iterator[Finding]:
-    if len(s.names) < FEW_PHOTOS:
-        why = "Many wrong scenes explain so few: new views will look torn."
-        what = f"There are only {len(s.names)} photos. {why}"
-        fix = "Take more photos that overlap: dozens of an object, hundreds of a building."
-        yield warning("few-photos", what, fix)
-    if len(s.train) < 2:
-        what = f"Views to train on: {len(s.train)}; held out: {len(s.held_out)}."
-        fix = f"Hold out fewer: {READER}.eval-interval, or {READER}.eval-mode all."
-        yield warning("few-training-views", what, fix)
+    if len(s.names) < FEW_PHOTOS or len(s.train) < 2:
+        yield warning(
+            "few-photos",
+            f"There are only {len(s.names)} photos, {len(s.train)} of them to train on. Many wrong scenes "
+            "explain so few: new views will look torn.",
+            "Take more photos that overlap: dozens of an object, hundreds of a building. Or hold out fewer: "
+            f"{OPTION}eval-interval, or {OPTION}eval-mode all.",
+        )
     if s.copies:
         held_out = set(s.held_out)
         leaks = sum(0 < len(held_out & set(rows)) < len(rows) for rows in s.copies)
@@ -74,11 +68,6 @@ def _of_the_set(s: Survey) -> Iterator[Finding]:
             "Photograph with fixed exposure and white balance, even the photos out, or train with "
             "--pipeline.training.light affine.",
         )
-    width, height = max((source.size for source in s.sources), key=np.prod)
-    if width * height > MANY_PIXELS:
-        what = f"Photos of up to {width} x {height} px are trained on, which takes long."
-        fix = f"For a first result leave out {DOWNSCALE}: photos are then reduced to {MAX_AUTO_SIDE} px."
-        yield note("large-photos", what, fix)
     needed, budget = s.photo_bytes, default_budget()
     if needed > budget:
         yield note(
@@ -111,8 +100,7 @@ def _of_single_photos(s: Survey) -> Iterator[Finding]:
 
 
 def _of_cameras(s: Survey) -> Iterator[Finding]:
-    away = np.linalg.norm(s.centers - np.median(s.centers, axis=0), axis=1)
-    usual = float(np.quantile(away, 0.75, method="lower"))
+    away, usual = _distances(s.centers, 0.75)
     far = np.flatnonzero(away > FAR_CAMERA * usual) if usual else []
     count, names = _named(s.names[row] for row in far)
     if count:
@@ -144,52 +132,37 @@ def _of_cameras(s: Survey) -> Iterator[Finding]:
         )
 
 
-def _of_pictures(s: Survey) -> Iterator[Finding]:
-    points, count = s.seen.in_view, len(s.points)
-    if count and not points.any():
-        yield warning(
-            "no-view-sees-points",
-            f"None of the {count:,} points lies in any picture. Points and cameras are of different models, "
-            "or in different coordinates.",
-            "Take both from one reconstruction. In transforms.json, ply_file_path must be in the coordinates "
-            "of the frames.",
-        )
-    if not points.any():
-        return
-    views, names = _named(f"{s.names[row]} (0)" for row in np.flatnonzero(points == 0))
-    if views:
-        what = f"{views} without any point in the picture: {names}. Their poses are doubtful."
-        fix = "Look at these photos. If they show the scene, make the model again, else remove them."
-        yield warning("views-without-points", what, fix)
-    sparse = np.flatnonzero((points > 0) & (points < FEW_POINTS_IN_VIEW))
-    views, names = _named(f"{s.names[row]} ({points[row]:.0f})" for row in sparse)
-    if views:
-        few_in = f"{views} with fewer than {FEW_POINTS_IN_VIEW} points in the picture"
-        fix = "See whether they are blurred or show little; more photos around them help."
-        yield warning("views-with-few-points", f"{few_in}: {names}. Their poses may be inexact.", fix)
+def _of_points(s: Survey) -> Iterator[Finding]:
+    count, in_view = len(s.points), s.seen.in_view
+    if 0 < count < FEW_POINTS:
+        what = f"Only {count} points. Gaussians begin at points, so most surfaces begin without any."
+        fix = "See whether the reconstruction is complete; more features and more matches give more points."
+        yield warning("few-points", what, fix)
     if s.seen.in_none > UNSEEN * count:
         yield warning(
             "unseen-points",
             f"{s.seen.in_none / count:.0%} of the points lie in no picture, {s.seen.behind_all / count:.0%} "
             "behind every camera. No photo can correct Gaussians that begin there.",
             "If photos were taken away, fine. Else points and cameras are not of one model: take both from "
-            "one.",
+            "one. In transforms.json, ply_file_path must be in the coordinates of the frames.",
         )
-
-
-def _of_points(s: Survey) -> Iterator[Finding]:
-    if 0 < len(s.points) < FEW_POINTS:
-        what = f"Only {len(s.points)} points. Gaussians begin at points, so most surfaces begin without any."
-        fix = "See whether the reconstruction is complete; more features and more matches give more points."
-        yield warning("few-points", what, fix)
-    if len(s.points) < 10:
-        return
-    away = np.linalg.norm(s.points - np.median(s.points, axis=0), axis=1)
-    usual = float(np.quantile(away, 0.9))
-    if usual and (count := int((away > FAR_POINT * usual).sum())):
+    sparse = np.flatnonzero(in_view < FEW_POINTS_IN_VIEW) if in_view.any() else []
+    views, names = _named(f"{s.names[row]} ({in_view[row]:.0f})" for row in sparse)
+    if views:
+        what = f"{views} with fewer than {FEW_POINTS_IN_VIEW} points in the picture: {names}."
+        fix = "See whether they are blurred or show little. Without any point they are likely misplaced."
+        yield warning("views-with-few-points", f"{what} Their poses may be inexact.", fix)
+    away, usual = _distances(s.points, 0.9) if count >= 10 else (np.zeros(1), 0.0)
+    if usual and (far := int((away > FAR_POINT * usual).sum())):
         yield warning(
             "far-points",
-            f"{count:,} far from the other points, up to {away.max() / usual:,.0f} times as far from the "
+            f"{far:,} far from the other points, up to {away.max() / usual:,.0f} times as far from the "
             "middle as nine tenths of them. Each becomes a huge Gaussian.",
             "If they are no distant background, remove them (`point_filtering` of the program colmap).",
         )
+
+
+def _distances(places: np.ndarray, share: float) -> tuple[np.ndarray, float]:
+    """From the middle of the places, and within which of them this share lies."""
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return away, float(np.quantile(away, share, method="lower"))

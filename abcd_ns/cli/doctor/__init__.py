@@ -1,4 +1,4 @@
 """`abcd doctor`: whether this machine and environment can train, and what to do where not.
 
-`facts` and `kernels` look, `rules` judge.
+`facts` looks, `rules` judge.
 """

@@ -1,8 +1,10 @@
 """All that `abcd doctor` knows of a machine. Looking compiles nothing and writes nothing."""
 
-import importlib
+import importlib.util
+import logging
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -17,8 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 from abcd_ns import __version__
-from abcd_ns.cli.doctor.kernels import look_at_kernels
-from abcd_ns.cli.train import find_ns_train
+from abcd_ns.cli.train import find_tool
 from abcd_ns.errors import IMPORT_TROUBLE, first_line
 from abcd_ns.machine import describe_machine, output_of, own_commit, package_version
 from abcd_ns.units import bytes_in_words
@@ -31,6 +32,9 @@ EXPORT = "open3d"
 """What `ns-export` and `abcd mesh` need besides; heavy, so imported in a process of its own."""
 STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", OURS, EXPORT)
 """Modules that are imported, each after what it needs."""
+COMPILER = "C++ compiler"
+EXTENSION = "gsplat_cuda"
+"""gsplat's name for what it compiles at first use."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,6 @@ class Facts:
     ram_free_bytes: int
     disk_free_bytes: int
     """Where `ns-train`, called here, would write."""
-    may_write: bool
     driver: str | None
     """Of an NVIDIA device, whether torch sees it or not."""
     cpu: str | None = None
@@ -72,13 +75,12 @@ class Facts:
     """Whether that library is there."""
     gsplat: str | None = None
     """gsplat's compiled extension."""
-    compiler: str | None = None
-    nvcc: str | None = None
-    ninja: bool = False
-    self_check: dict[str, float] = field(default_factory=dict)
-    """By rasterizer and device, the largest relative difference to the reference."""
-    failed: dict[str, str] = field(default_factory=dict)
-    """Likewise, what is wrong with one."""
+    build_tools: dict[str, str | None] = field(default_factory=dict)
+    """What compiles gsplat's: the version of nvcc, where the others are; None where one is missing."""
+    difference: float | None = None
+    """The largest relative one of the CPU rasterizer to the reference. Training checks gsplat's."""
+    failed: str | None = None
+    """What is wrong with it."""
     lpips_missing: str | None = None
     """Why LPIPS cannot be computed, if so."""
 
@@ -91,9 +93,6 @@ def gather() -> Facts:
     memory, place = psutil.virtual_memory(), Path("outputs") if Path("outputs").is_dir() else Path()
     number, plus, changes = (own_commit() or "").partition("+")
     driver = output_of("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
-    seen = {} if "torch" in broken else _seen_by_torch()
-    if not broken.keys() & {"torch", OURS}:
-        seen |= look_at_kernels(on_gpu=seen["gpu"] is not None)
     return Facts(
         abcd_ns=__version__ + (f", commit {number[:10]}{plus}{changes}" if number else ""),
         python=platform.python_version(),
@@ -101,14 +100,14 @@ def gather() -> Facts:
         ray=package_version("ray"),
         broken=broken,
         registered="abcd" in {entry.name for entry in entry_points(group="nerfstudio.method_configs")},
-        has_ns_train=find_ns_train() is not None,
+        has_ns_train=find_tool("ns-train") is not None,
         os=f"{platform.system()} {platform.release()} {platform.machine()}",
         ram_bytes=memory.total,
         ram_free_bytes=memory.available,
         disk_free_bytes=shutil.disk_usage(place).free,
-        may_write=os.access(place, os.W_OK),
         driver=driver.split()[0] if driver else None,
-        **seen,
+        **({} if "torch" in broken else _seen_by_torch()),
+        **({} if broken.keys() & {"torch", OURS} else _kernels()),
     )
 
 
@@ -144,3 +143,50 @@ def _seen_by_torch() -> dict[str, Any]:
             gpu = f"{found.name}, {memory}, capability {found.major}.{found.minor}"
     known = {"gpu": gpu, "gpus": torch.cuda.device_count(), "torch_cuda": torch.version.cuda}
     return {"cpu": machine.cpu, "cores": machine.cores, **known}
+
+
+def _kernels() -> dict[str, Any]:
+    """The fields of Facts from `folder` on: what is built, what could be, and whether it computes right."""
+    from abcd_ns.engine.kernels import find_compiler, kernels_folder
+    from abcd_ns.engine.kernels.native import library_path
+    from abcd_ns.engine.render import TorchRasterizer, self_check
+    from abcd_ns.nerfstudio.metrics import lpips_missing
+
+    extension, built = find_extension(), library_path().is_file()
+    nvcc = re.search(r"release ([\d.]+)", output_of("nvcc", "--version") or "")
+    difference, failed = None, None
+    try:
+        difference = self_check(TorchRasterizer(use_native=built), "cpu")
+    except (RuntimeError, OSError, AttributeError) as error:
+        failed = first_line(error)
+    return {
+        "folder": str(kernels_folder()),
+        "built": built,
+        "gsplat": extension and str(extension),
+        "build_tools": {"nvcc": nvcc and nvcc[1], "ninja": shutil.which("ninja"), COMPILER: find_compiler()},
+        "difference": difference,
+        "failed": failed,
+        "lpips_missing": lpips_missing(),
+    }
+
+
+def find_extension() -> Path | None:
+    """gsplat's CUDA kernels, from its wheel or from an earlier run."""
+    package = importlib.util.find_spec("gsplat")
+    folders = [Path(folder) for folder in package.submodule_search_locations or ()] if package else []
+    found = [*(path for folder in folders for path in folder.glob("csrc*.so")), built_extension()]
+    return next((path for path in found if path.is_file()), None)
+
+
+def built_extension() -> Path:
+    """What gsplat compiles. torch's own `_get_build_directory` would make its folder."""
+    import torch
+
+    # Its import says that there is no GPU, where there is none.
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
+    from torch.utils.cpp_extension import get_default_build_root
+
+    kind = f"cu{torch.version.cuda.replace('.', '')}" if torch.version.cuda else "cpu"
+    of_this_python = f"py{sys.version_info.major}{sys.version_info.minor}{sys.abiflags}_{kind}"
+    default = Path(get_default_build_root()) / of_this_python
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or default) / EXTENSION / f"{EXTENSION}.so"

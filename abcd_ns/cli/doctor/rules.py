@@ -1,16 +1,13 @@
 """What is wrong or missing on a machine, and what to do about it."""
 
-import re
 from collections.abc import Iterator
 
-from abcd_ns.cli.doctor.facts import EXPORT, Facts
+from abcd_ns.cli.doctor.facts import COMPILER, EXPORT, Facts
 from abcd_ns.cli.findings import Finding, error, note, warning
 from abcd_ns.units import GIB, bytes_in_words
 
 TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
 """Versions whose insides are relied on."""
-VISER_REPAIRED = (1, 0, 25)
-"""The first version of viser that serves its own files only."""
 LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
 """Free bytes below which runs of usual size end early."""
 SYSTEM_LIBRARIES = "sudo apt-get install libgl1 libegl1 libgomp1 libusb-1.0-0 libx11-6"
@@ -24,7 +21,6 @@ def findings_of(f: Facts) -> Iterator[Finding]:
     yield from _of_versions(f)
     yield from _of_the_machine(f)
     if f.folder is not None:
-        yield from _of_cuda(f) if f.gpu else _of_the_cpu(f)
         yield from _of_kernels(f)
 
 
@@ -56,21 +52,9 @@ def _of_versions(f: Facts) -> Iterator[Finding]:
         if version is not None and version.split("+")[0] != tested:
             what = f"{name} is {version}; abcd_ns was tested with {tested} and relies on its insides."
             yield warning("untested-version", what, f"If something fails, try pip install {name}=={tested}")
-    viser = f.versions.get("viser")
-    if viser is not None and numbers(viser) < VISER_REPAIRED:
-        yield note(
-            "viewer-hole",
-            f"viser {viser} sends every file that you can read to anyone that reaches the viewer's port. "
-            "nerfstudio listens on all networks, `ns-train abcd` on this machine alone.",
-            "For other methods, and with ns-viewer on their runs: --viewer.websocket-host 127.0.0.1; from "
-            "another machine use ssh -L 7007:127.0.0.1:7007 HOST",
-        )
 
 
 def _of_the_machine(f: Facts) -> Iterator[Finding]:
-    if not f.may_write:
-        what = "You may not write into this folder, where ns-train makes `outputs`."
-        yield error("read-only-folder", what, "Go to another folder, or give ns-train --output-dir FOLDER")
     if f.disk_free_bytes < LITTLE_DISK:
         yield warning(
             "little-disk",
@@ -99,24 +83,22 @@ def _of_the_machine(f: Facts) -> Iterator[Finding]:
         yield warning("cuda-unavailable", f"{there}, built for CUDA {f.torch_cuda}, cannot use it.", fix)
 
 
-def _of_cuda(f: Facts) -> Iterator[Finding]:
-    """Whether gsplat's kernels are there, or can be built."""
-    if f.gsplat is not None:
-        return
-    tools, none = {"nvcc": f.nvcc, "ninja": f.ninja, "a C++ compiler": f.compiler}, "are not built."
-    if missing := ", ".join(name for name, there in tools.items() if not there):
+def _unbuilt(f: Facts) -> Iterator[Finding]:
+    """Whether gsplat's kernels, which are not there, can be built."""
+    none, nvcc = "are not built.", f.build_tools["nvcc"]
+    if missing := ", ".join(name for name, there in f.build_tools.items() if not there):
         yield error(
             "gsplat-cannot-be-built",
             f"gsplat's CUDA kernels {none} To build them, the PATH lacks {missing}.",
             f"Install the CUDA toolkit {f.torch_cuda} (nvcc), g++ and ninja. Or train slowly, with "
             "--pipeline.model.rasterizer torch",
         )
-    elif numbers(f.nvcc or "")[:1] != numbers(f.torch_cuda or "")[:1]:
+    elif nvcc.split(".")[0] != (f.torch_cuda or "").split(".")[0]:
         yield error(
             "gsplat-cannot-be-built",
-            f"gsplat's CUDA kernels {none} nvcc is of CUDA {f.nvcc}, but torch is built for {f.torch_cuda} "
+            f"gsplat's CUDA kernels {none} nvcc is of CUDA {nvcc}, but torch is built for {f.torch_cuda} "
             "and refuses to compile with another.",
-            f"Put the nvcc of CUDA {f.torch_cuda} first on the PATH, or install torch for {f.nvcc}.",
+            f"Put the nvcc of CUDA {f.torch_cuda} first on the PATH, or install torch for {nvcc}.",
         )
     else:
         yield note(
@@ -127,26 +109,15 @@ def _of_cuda(f: Facts) -> Iterator[Finding]:
         )
 
 
-def _of_the_cpu(f: Facts) -> Iterator[Finding]:
-    if not f.built and f.compiler:
-        what = "The CPU rasterizer is not compiled yet. First use compiles it, in some 15 seconds."
-        yield note("library-not-compiled", what)
-    elif not f.built:
+def _of_kernels(f: Facts) -> Iterator[Finding]:
+    if f.gpu and f.gsplat is None:
+        yield from _unbuilt(f)
+    if not f.gpu and not f.built and not f.build_tools[COMPILER]:
         what = "There is no C++ compiler for the CPU rasterizer. Training works, some 20 times slower."
         yield warning("no-compiler", what, "Install one: sudo apt-get install g++")
-
-
-def _of_kernels(f: Facts) -> Iterator[Finding]:
-    for name, why in f.failed.items():
+    if f.failed:
         fix = f"Delete {f.folder}, so that its library is compiled anew."
-        if name.startswith("gsplat"):
-            fix = f"Train with --pipeline.model.rasterizer torch, or delete {f.gsplat}: it is built anew."
-        yield error("self-check", f"{name}: {why}", fix)
+        yield error("self-check", f"The CPU rasterizer: {f.failed}", fix)
     if f.lpips_missing:
         what = f"{f.lpips_missing}. Nothing is downloaded by default. Until then scores are PSNR and SSIM."
         yield note("no-lpips", what)
-
-
-def numbers(version: str) -> tuple[int, ...]:
-    """ "1.0.25rc1" as (1, 0, 25, 1)."""
-    return tuple(map(int, re.findall(r"\d+", version.split("+")[0])))

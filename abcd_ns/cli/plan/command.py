@@ -15,16 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from abcd_ns import methods
-from abcd_ns.cli.plan.forecast import (
-    Forecast,
-    device_shares,
-    disk_shares,
-    in_words,
-    ram_shares,
-    sent_shares,
-    time_steps,
-    views_of_blocks,
-)
+from abcd_ns.cli.plan.forecast import Forecast, in_words, shares_of, time_steps
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
@@ -76,7 +67,7 @@ def plan(
         data: Folder of the scene, as for `ns-train abcd --data`.
         wanted: Options of the run.
         downscale: Divides the photos' width and height. Left out, no side is over 1600 px, as in training.
-        verbose: Show what takes the memory, and the points and views of the blocks.
+        verbose: Show what takes the memory, and the points of the blocks.
 
     Returns:
         0; 1 if something would not fit.
@@ -130,7 +121,7 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
 
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
-    """Cut the points into blocks, count the views of each, and time a step.
+    """Cut the points into blocks, and time a step.
 
     Raises:
         UserError: the device's budget has no room for any block.
@@ -146,8 +137,6 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
     counts = owner.bincount(minlength=fit.blocks)
-    with console.status("Looking which view sees which block"):
-        seen = views_of_blocks(tree, points, views)
     batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
     needs = demand.needs(batch, training.limits.crop_pixels, levels_of(fit.blocks))
     fullest = owner == counts.argmax()
@@ -160,13 +149,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         fit=fit,
         points=len(points),
         batch=batch,
-        views_of_block=seen,
         points_of_block=tuple(counts.tolist()),
-        shares={
-            "device": device_shares(fit, needs),
-            "RAM": ram_shares(fit, needs, photo_bytes, wanted.workers),
-            "disk": disk_shares(fit, needs),
-        },
+        shares=shares_of(fit, needs, photo_bytes, wanted.workers),
         free={
             "device": fit.budget,
             "RAM": psutil.virtual_memory().available,
@@ -176,7 +160,6 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         seconds_per_step=seconds,
         workers=wanted.workers,
         factor=capture.factor,
-        sent=sent_shares(fit, needs) if wanted.workers > 1 else {},
     )
 
 
@@ -201,23 +184,21 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
         "time": f"{in_words(low)} to {in_words(high)}: {found.steps:,} steps of {views}",
     }
-    for place, shares in found.shares.items():
-        needed, free = sum(shares.values()), found.free[place]
-        rows[place] = f"{bytes_in_words(needed)} at most, {bytes_in_words(free)} may be taken"
-        rows |= {f"  {what}": bytes_in_words(nbytes) for what, nbytes in shares.items() if verbose}
     if found.workers > 1:
-        rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device above"
-        rows["sent a visit"] = f"{bytes_in_words(sum(found.sent.values()))} at most"
-        rows |= {f"  {what}": bytes_in_words(nbytes) for what, nbytes in found.sent.items() if verbose}
+        rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device below"
+    for place, shares in found.shares.items():
+        free = f", {bytes_in_words(found.free[place])} may be taken" if place in found.free else ""
+        rows[place] = f"{bytes_in_words(sum(shares.values()))} at most{free}"
+        rows |= {f"  {what}": bytes_in_words(nbytes) for what, nbytes in shares.items() if verbose}
     if verbose:
-        for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
-            rows[f"{what} by block"] = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
+        points = found.points_of_block
+        rows["points by block"] = f"{min(points):,} to {max(points):,}, median {median(points):,.0f}"
         rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
         rows["limits"] = fit.in_words() if fit.sole else "none of a block's Gaussians, as --blocks is given"
     print_facts(rows, console)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
-    for line in found.advice:
-        console.print(f"[yellow]note:[/] {line}", highlight=False)
+    if found.advice:
+        console.print(f"[yellow]note:[/] {found.advice}", highlight=False)
     if not (found.warnings or verbose):
         console.print("\nAll of it fits. What takes the memory: abcd plan --verbose", highlight=False)

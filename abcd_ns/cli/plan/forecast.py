@@ -4,14 +4,11 @@ import time
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
-from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
@@ -20,8 +17,6 @@ from abcd_ns.units import bytes_in_words
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
-MOST_POINTS = 200_000
-"""Of more than these, an evenly spaced choice is looked at."""
 GENERATIONS = 2
 """Of the store on disk: the one in use, and the one that the last checkpoint pins."""
 TIMED_STEPS = 3
@@ -48,11 +43,9 @@ class Forecast:
     fit: Fit
     points: int
     batch: int
-    views_of_block: tuple[int, ...]
-    """By block, the training views in which one of its points is."""
     points_of_block: tuple[int, ...]
     shares: dict[str, Shares]
-    """By place, of PLACES."""
+    """By place, see `shares_of`."""
     free: dict[str, int]
     """Bytes that may be taken there."""
     steps: int
@@ -61,8 +54,6 @@ class Forecast:
     workers: int
     factor: int
     """By which the photos' width and height are divided."""
-    sent: Shares
-    """What a visit by a worker moves; nothing without workers."""
 
     @property
     def hours(self) -> tuple[float, float]:
@@ -82,19 +73,14 @@ class Forecast:
         return lines
 
     @property
-    def advice(self) -> list[str]:
-        """What can be trained, but would take long or turn out badly, each with what to do about it."""
-        lines, views = [], self.views_of_block
-        few = sum(count <= TOO_FEW_VIEWS for count in views)
-        if few and len(views) > 1:
-            seen = f"{few} of {len(views)} blocks are seen by fewer than {TOO_FEW_VIEWS + 1} views"
-            lines.append(f"{seen}: use fewer --blocks.")
-        if self.hours[1] >= DAY:
-            lines.append(
-                f"This may take {in_words(self.hours[1])}. `ns-train abcd --pipeline.max-seconds 7200` ends "
-                f"it after two hours. Smaller photos (--downscale {2 * self.factor}) and fewer --steps help."
-            )
-        return lines
+    def advice(self) -> str | None:
+        """What helps if the run would take long."""
+        if self.hours[1] < DAY:
+            return None
+        return (
+            f"This may take {in_words(self.hours[1])}. `ns-train abcd --pipeline.max-seconds 7200` ends "
+            f"it after two hours. Smaller photos (--downscale {2 * self.factor}) and fewer --steps help."
+        )
 
 
 def in_words(hours: float) -> str:
@@ -104,65 +90,38 @@ def in_words(hours: float) -> str:
     return f"{hours * 60:.0f} min" if hours < 2 else f"{hours:.0f} h"
 
 
-def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
-    """By block, the number of views that have one of its points in the picture.
+def shares_of(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> dict[str, Shares]:
+    """What a run takes at most, by place of PLACES; and, with workers, what moves for a visit by one.
 
-    Args:
-        points: [n, 3], world space.
+    RAM is beside Python and torch. A worker's machine caches what it was sent until that changes.
     """
-    owner, counts = tree.assign(points), torch.zeros(tree.num_blocks, dtype=torch.int64)
-    # Millions of points, for thousands of views, take many minutes. The choice follows the order of blocks,
-    # so that each has its share of it: some hundreds of a block's points are enough to tell who sees it.
-    chosen = owner.argsort(stable=True)[:: -(-len(points) // MOST_POINTS) or 1]
-    owner, points = owner[chosen], points[chosen].double()
-    for view in views:
-        counts[owner[view.depths_of(points)[1]].unique()] += 1
-    return tuple(counts.tolist())
-
-
-def device_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
-    """What a visit to a block of the expected size takes on the device."""
-    largest = _largest(fit)
-    return {
-        f"a block of {largest:,} Gaussians in training": largest * needs.gaussian_bytes,
-        "a step's pictures, or layers while they are drawn": needs.fixed_bytes,
-        "layers that are kept": needs.layer_bytes(fit.budget),
-        "photos that are kept": needs.photo_bytes(fit.budget),
+    # The largest block, as far as can be said.
+    largest, limit = -(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit
+    largest = min(largest, limit) if limit else largest
+    scene, block = fit.gaussians * needs.parameter_bytes, largest * needs.parameter_bytes
+    there_and_back, kept = 2 * STATES * block, RamShares.of(0)
+    shares = {
+        "device": {
+            f"a block of {largest:,} Gaussians in training": largest * needs.gaussian_bytes,
+            "a step's pictures, or layers while they are drawn": needs.fixed_bytes,
+            "layers that are kept": needs.layer_bytes(fit.budget),
+            "photos that are kept": needs.photo_bytes(fit.budget),
+        },
+        "RAM": {
+            "decoded photos": min(photo_bytes, kept.photos),
+            "frozen blocks": min(scene, kept.blocks),
+            "the whole scene, while a checkpoint is written": scene,
+        },
+        "disk": {"blocks with their optimiser's state": GENERATIONS * STATES * scene, "checkpoint": scene},
     }
-
-
-def _largest(fit: Fit) -> int:
-    """Gaussians of the largest block, as far as can be said."""
-    share, limit = -(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit
-    return min(share, limit) if limit else share
-
-
-def sent_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
-    """What a visit by a worker moves at most: a machine caches what it was sent until that changes."""
-    block = _largest(fit) * needs.parameter_bytes
-    return {
-        "its block, with the optimiser's state, there and back": 2 * STATES * block,
-        "the blocks around it, as they are drawn": fit.gaussians * needs.parameter_bytes - block,
-    }
-
-
-def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> Shares:
-    """What the rest takes in RAM, beside Python and torch."""
-    scene = fit.gaussians * needs.parameter_bytes
-    out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
-    shares = RamShares.of(0)
-    sent = {"blocks in flight, there and back, and those around them": out + scene}
-    return (sent if workers > 1 else {}) | {
-        "decoded photos": min(photo_bytes, shares.photos),
-        "frozen blocks": min(scene, shares.blocks),
-        "the whole scene, while a checkpoint is written": scene,
-    }
-
-
-def disk_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
-    """What a run leaves and holds on disk."""
-    scene = fit.gaussians * needs.parameter_bytes
-    return {"blocks with their optimiser's state": GENERATIONS * STATES * scene, "checkpoint": scene}
+    if workers > 1:
+        in_flight = SLACK * workers * there_and_back + scene
+        shares["RAM"]["blocks in flight, there and back, and those around them"] = in_flight
+        shares["sent a visit"] = {
+            "its block, with the optimiser's state, there and back": there_and_back,
+            "the blocks around it, as they are drawn": scene - block,
+        }
+    return shares
 
 
 def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig, batch: int) -> float:

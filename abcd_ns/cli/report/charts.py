@@ -1,6 +1,5 @@
 """The charts of one run, as SVG images that stand in the page."""
 
-import base64
 from collections.abc import Sequence
 from io import BytesIO
 
@@ -16,6 +15,7 @@ from abcd_ns.cli.report.story import Story
 from abcd_ns.lab.results.style import COLORS, in_style, lay_grid, short
 from abcd_ns.nerfstudio.run.log_lines import SampleLine, TrainingLine
 from abcd_ns.units import GIB
+from abcd_ns.viewer.images import data_uri
 
 WIDTH, HEIGHT = 8.0, 2.6
 """Inches."""
@@ -145,4 +145,4 @@ def _over_time(axes: Axes, story: Story, what: str) -> Axes:
 def _uri(figure: Figure) -> str:
     stream = BytesIO()
     figure.savefig(stream, format="svg", transparent=True, dpi=150, metadata={"Date": None})
-    return f"data:image/svg+xml;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return data_uri(stream, "svg+xml")

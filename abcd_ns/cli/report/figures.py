@@ -4,7 +4,6 @@ from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.terminal import many
 from abcd_ns.engine.train.health_record import BlockHealth, standing
-from abcd_ns.engine.train.memory import FLOAT
 from abcd_ns.lab.results.tables import NOTHING
 from abcd_ns.nerfstudio.run.log_lines import (
     EndLine,
@@ -16,7 +15,7 @@ from abcd_ns.nerfstudio.run.log_lines import (
     WorkerLine,
     layer_share,
 )
-from abcd_ns.units import GIB, MIB
+from abcd_ns.units import GIB
 from abcd_ns.viewer.texts import clock
 
 BLOCK_TITLES = ("block", "Gaussians", "pruned", "views", "visits", "time", "layers", "PSNR", "state")
@@ -63,10 +62,6 @@ def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
         cost, views = pruned.before - pruned.after, many(pruned.views, "training view", "training views")
         share = pruned.gone / max(pruned.gone + pruned.gaussians, 1)
         found["pruned at the end"] = f"{pruned.gone:,} ({share:.0%}), costs {cost:.2f} dB on {views}"
-    if run.parameters and run.checkpoint is not None:
-        each = run.parameters / max(len(run.checkpoint.means), 1)
-        size = f"{FLOAT * run.parameters / MIB:.1f} MiB"
-        found["parameters"] = f"{run.parameters:,}, {each:.1f} a Gaussian, {size}"
     if workers:
         waited = sum(worker.waited for worker in workers) / len(workers)
         deaths = sum(worker.deaths for worker in workers)

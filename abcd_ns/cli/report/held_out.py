@@ -1,6 +1,5 @@
 """Held-out views of a run: scores of all of them, and pictures of a few."""
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -17,6 +16,7 @@ from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray,
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, score, squared_gap
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.viewer.images import data_uri
 
 PAGE_PIXELS = 6_000_000
 """Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MiB."""
@@ -85,12 +85,12 @@ def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
     return {ranked[rank].row: words.get(rank, f"{rank + 1} of {last + 1}") for rank in ranks}
 
 
-def data_uri(picture: PictureArray, width: int, height: int) -> str:
+def _resized(picture: PictureArray, width: int, height: int) -> str:
     """A picture, uint8 [h, w, 3], in another size, as a PNG or JPEG that stands in the page itself."""
     stream, kind = BytesIO(), "png" if width * height <= LOSSLESS_PIXELS else "jpeg"
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
     small.save(stream, kind, quality=88, optimize=True)
-    return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return data_uri(stream, kind)
 
 
 def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
@@ -100,7 +100,7 @@ def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
     height, width = photo.shape[:2]
     scale = min(1.0, (PAGE_PIXELS / (3 * count * height * width)) ** 0.5)
     width, height = max(round(width * scale), 1), max(round(height * scale), 1)
-    uris = [data_uri(image, width, height) for image in (photo, picture, error)]
+    uris = [_resized(image, width, height) for image in (photo, picture, error)]
     return Shown(scored, place, *uris, width, height)
 
 

@@ -19,7 +19,7 @@ from abcd_ns.cli.report.story import Story
 from abcd_ns.lab.compare.pictures import ERROR_GAIN
 from abcd_ns.lab.results.tables import NOTHING, about_machine
 from abcd_ns.machine import without_home
-from abcd_ns.nerfstudio.run.log_lines import TrainingLine
+from abcd_ns.nerfstudio.run.log_lines import EndLine, TrainingLine
 
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
@@ -78,4 +78,4 @@ def render_page(
 
 def _unfinished(story: Story) -> list[str]:
     resumed = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]
-    return resumed if story.ended else [*resumed, "not ended: still running, or interrupted"]
+    return resumed if story.last(EndLine) else [*resumed, "not ended: still running, or interrupted"]

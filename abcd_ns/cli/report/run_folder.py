@@ -60,8 +60,6 @@ class RunFolder:
     """None where the run ended before its first."""
     state: RunState = field(default_factory=RunState)
     """Of the planner at the checkpoint, or else the last that was saved."""
-    parameters: int = 0
-    """Of all Gaussians; 0 where it is not known."""
 
 
 def open_run(path: Path) -> RunFolder:
@@ -74,7 +72,7 @@ def open_run(path: Path) -> RunFolder:
     checkpoint = _newest(path / CHECKPOINTS)
     if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
         story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
-    return RunFolder(path, settings, story, checkpoint, *_read_store(path / STATE / STORE, checkpoint))
+    return RunFolder(path, settings, story, checkpoint, _read_state(path / STATE / STORE, checkpoint))
 
 
 def read_settings(path: Path) -> Settings:
@@ -166,15 +164,14 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(one_line(why)) from None
 
 
-def _read_store(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState, int]:
-    """The planner's state and the number of parameters, at the checkpoint or else as saved last."""
+def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState:
+    """The planner's state at the checkpoint, or else as saved last."""
     if not folder.is_dir():
-        return RunState(), 0
+        return RunState()
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
-        blocks = [block for block in store.blocks if isinstance(block, int)]
-        return RunState.from_json(store.state), sum(store.meta(block)["parameters"] for block in blocks)
+        return RunState.from_json(store.state)
     except StoreError as error:
         raise UserError(one_line(str(error))) from None

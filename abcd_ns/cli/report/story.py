@@ -51,11 +51,6 @@ class Story:
         return tuple(line for line in self.of(HeldOutLine) if line.psnr is not None)
 
     @property
-    def ended(self) -> bool:
-        """Whether the run came to its end; else it goes on, or was killed."""
-        return self.last(EndLine) is not None
-
-    @property
     def step(self) -> int:
         """The last that is known of."""
         return self.lines[-1].step

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import psutil
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import Progress, TaskID, TextColumn
+from rich.live import Live
+from rich.text import Text
 
 from abcd_ns.engine.events import (
     EpochEnded,
@@ -28,7 +29,7 @@ from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words
-from abcd_ns.viewer.run_history import time_left
+from abcd_ns.viewer.status import time_left
 from abcd_ns.viewer.texts import clock
 
 SECONDS_BETWEEN_LINES = 10.0
@@ -53,18 +54,16 @@ class ProgressReport:
         self._coordinator, self._visits = coordinator, visits
         self._held_out: HeldOutScored | None = None
         self._psnr: float | None = None
-        self._epoch = 0
         self._visit: VisitBegan | None = None
         self._workers: tuple[WorkerSeen, ...] = ()
         self._last_line = self._last_look = time.monotonic()
-        self._live: Progress | None = None
-        self._task: TaskID | None = None
+        self._live: Live | None = None
 
     def __call__(self, event: Event) -> None:
         """Take note of an event."""
         match event:
             case VisitBegan():
-                self._visit, self._epoch = event, event.sweep
+                self._visit = event
                 self._show("")
             case LayersDrawn():
                 self._show(f"layers {event.done}/{event.total}")
@@ -95,7 +94,7 @@ class ProgressReport:
         found = {
             "block": 0 if block is None else block + 1,
             "blocks": coordinator.scene.tree.num_blocks,
-            "sweep": self._epoch,
+            "sweep": coordinator.state.sweep,
             "gaussians": coordinator.count(),
             "share of time for layers": layer_share(self._visits),
             "RAM (GiB)": psutil.Process().memory_info().rss / GIB,
@@ -145,8 +144,10 @@ class ProgressReport:
         if CONSOLE.is_terminal:
             if now - self._last_look >= SECONDS_BETWEEN_LOOKS:
                 self._last_look = now
-                line = fitting(self._parts(what, pruned), CONSOLE.width - 1)
-                self._bar().update(self._task, what=line)
+                if self._live is None:
+                    self._live = Live(console=CONSOLE, transient=True)
+                    self._live.start()
+                self._live.update(Text(fitting(self._parts(what, pruned), CONSOLE.width - 1)))
         elif now - self._last_line > SECONDS_BETWEEN_LINES:
             self._print(f"  {'  '.join(self._parts(what, pruned))}")
 
@@ -176,13 +177,6 @@ class ProgressReport:
             _memory(),
         ]
         return [part for part in parts if part]
-
-    def _bar(self) -> Progress:
-        if self._live is None:
-            self._live = Progress(TextColumn("{task.fields[what]}"), console=CONSOLE, transient=True)
-            self._task = self._live.add_task("", total=1.0, what="")
-            self._live.start()
-        return self._live
 
 
 def fitting(parts: Sequence[str], width: int) -> str:

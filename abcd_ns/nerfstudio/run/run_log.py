@@ -31,7 +31,7 @@ from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.errors import UserError
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
-from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA, Line, VisitEndLine
+from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA, Line, SampleLine, VisitEndLine
 from abcd_ns.nerfstudio.run.resuming import RunRequest
 from abcd_ns.nerfstudio.run.settings import write_settings
 
@@ -66,15 +66,17 @@ class RunLog:
         self._path: Path | None = path
         self.visits: list[VisitEndLine] = []
         """Those that ended, of the whole run."""
+        self.curve: list[tuple[float, float]] = []
+        """Seconds of training, and the mean PSNR of training crops since the point before, dB."""
         self._psnrs: list[float] = []
         self._visit_psnrs: dict[int, list[float]] = {}
         self._lines: list[str] = []
         self._workers: tuple[WorkerSeen, ...] = ()
         if earlier is not None:
             past = past_of(coordinator, earlier)
-            lines = [line for line in map(json.loads, past) if line.pop("kind") == "visit end"]
-            with suppress(TypeError):  # of another version
-                self.visits = [VisitEndLine(**line) for line in lines]
+            with suppress(TypeError, KeyError):  # of another version
+                for line in map(json.loads, past):
+                    self._remember(KINDS[line.pop("kind")](**line))
             self._write(past, anew=True)
         self._sampled = coordinator.stopwatch.seconds
         budgets = {name: limit for name, (_, limit) in self._meters.items()}
@@ -127,7 +129,7 @@ class RunLog:
         told = vars(event) | {"layer_seconds": round(event.layer_seconds, 3)}
         seconds = round(told.pop("seconds"), 3)  # a line's own are of the whole run
         fields = {**told, "visit_seconds": seconds, "psnr": _mean(psnrs[len(psnrs) // 2 :])}
-        self.visits.append(self._note("visit end", **fields))
+        self._note("visit end", **fields)
         self._flush()
 
     def _sample(self) -> None:
@@ -141,13 +143,19 @@ class RunLog:
         )
         self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
 
-    def _note(self, kind: str, **fields: Any) -> Line:
+    def _note(self, kind: str, **fields: Any) -> None:
         now = {"step": self._coordinator.state.step, "seconds": round(self._coordinator.stopwatch.seconds, 3)}
         line = KINDS[kind](**now | fields)
         self._lines.append(json.dumps({"kind": kind, **asdict(line)}))
         if len(self._lines) >= LINES_KEPT:
             self._flush()
-        return line
+        self._remember(line)
+
+    def _remember(self, line: Line) -> None:
+        if isinstance(line, VisitEndLine):
+            self.visits.append(line)
+        elif isinstance(line, SampleLine) and line.psnr is not None:
+            self.curve.append((line.seconds, line.psnr))
 
     def _flush(self) -> None:
         lines, self._lines = self._lines, []

@@ -20,9 +20,9 @@ from tests.data.dataparser_scenes import NAMES, SIZES, write_model, write_photos
 def test_few_photos_and_a_split_that_leaves_one(tmp_path):
     write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2], params=wide)
     write_photos(tmp_path / "images", names=NAMES[:2])
-    said = names(examine(tmp_path).findings)
-    assert "few-photos" in said
-    assert "few-training-views" in said
+    (few,) = (finding for finding in examine(tmp_path).findings if finding.name == "few-photos")
+    assert "2 photos, 1 of them to train on" in few.what
+    assert "eval-mode all" in few.fix
 
 
 def test_copies_of_a_photo_are_named_and_leaks_counted(scene):
@@ -83,12 +83,6 @@ def test_photos_beyond_their_share_of_ram(found, monkeypatch):
     assert "photo-cache-gb" in the("photos-beyond-ram", found).fix
 
 
-def test_large_photos_come_with_what_helps(found):
-    source = replace(found.sources[0], stored=(6000, 4000), reduced=(6000, 4000))
-    large = replace(found, prepared=replace(found.prepared, sources=[source, *found.sources[1:]]))
-    assert "leave out --pipeline.datamanager.dataparser.downscale-factor" in the("large-photos", large).fix
-
-
 # Cameras
 
 
@@ -124,7 +118,7 @@ def test_views_without_points_are_named(found):
             pose[:, [0, 2]] *= -1
         return pose
 
-    assert found.names[3] in the("views-without-points", changed(found, averted)).what
+    assert f"{found.names[3]} (0)" in the("views-with-few-points", changed(found, averted)).what
 
 
 def behind(found: Survey, count: int) -> np.ndarray:
@@ -134,10 +128,9 @@ def behind(found: Survey, count: int) -> np.ndarray:
 
 
 def test_points_of_another_model_are_seen_by_no_view(found):
-    said = names(findings_of(changed(found, points=behind(found, POINTS))))
-    assert "no-view-sees-points" in said
-    assert "views-without-points" not in said
-    assert "unseen-points" not in said
+    foreign = changed(found, points=behind(found, POINTS))
+    assert the("unseen-points", foreign).what.startswith("100% of the points")
+    assert "views-with-few-points" not in names(findings_of(foreign))
 
 
 def test_views_with_few_points_come_with_their_number(found):

@@ -7,6 +7,7 @@ import pytest
 from abcd_ns.cli.report.charts import draw_progress
 from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.lab.results.records import RecordError
+from abcd_ns.nerfstudio.run.log_lines import EndLine
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
 
 
@@ -20,7 +21,7 @@ def test_a_log_tells_visits_and_totals(story):
     assert story.layer_share == 3 / 16
     assert [visit.psnr for visit in story.of_block(1)] == [22.0]
     assert (story.step, story.seconds, story.blocks, story.gaussians) == (40, 16.0, 3, 330)
-    assert not story.ended
+    assert story.last(EndLine) is None
     assert [story.seconds_at(step) for step in (0, 5, 25, 99)] == [0.0, 2.0, 10.0, 16.0]
 
 
