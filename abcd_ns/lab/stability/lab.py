@@ -1,9 +1,9 @@
-"""What a scenario is; small scenes trained with the bare engine, the same way for every method."""
+"""What a scenario is; small scenes trained without nerfstudio, the same way for every method."""
 
-import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -11,26 +11,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.space.distances import as_trained
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
-from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import coarse_model_size
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
+from abcd_ns.run import STORE
+from abcd_ns.run.begin import Capture, RunBuilder
+from abcd_ns.run.options import RunOptions
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
@@ -62,9 +59,15 @@ class Stage:
         """The training loop's photo reader."""
         return self.photos[index][crop.slices]
 
-    def start(self) -> Gaussians:
-        """The first Gaussians."""
-        return gaussians_from_points(self.points.float(), self.colors, sh_degree=SH_DEGREE)
+    def target(self, sample: Sample) -> Target:
+        """What a sample is trained on, without a mask."""
+        return sample.reduced(self(sample.view.index, sample.source)), None
+
+    def capture(self, sh_degree: int) -> Capture:
+        """What a run of this degree is trained on; it begins with a Gaussian for each point."""
+        names = [Path(str(view.index)) for view in self.views]
+        start = partial(gaussians_from_points, self.points.float(), self.colors, sh_degree=sh_degree)
+        return Capture(self.views, names, self.target, start, len(self.points))
 
     def only(self, count: int) -> "Stage":
         """With `count` of the training views, evenly spread."""
@@ -109,37 +112,28 @@ class Lab:
 
     def coordinator(
         self,
-        start: Gaussians,
-        views: list[View],
+        stage: Stage,
         method: Method = "abcd",
         *,
-        budget: int,
+        budget: int = BUDGET,
         blocks: int = BLOCKS,
-        tree: BlockTree | None = None,
+        partition: Literal["kd", "grid"] = "kd",
         **training: Any,
     ) -> Coordinator:
-        """A coordinator over a new store.
+        """A run that begins, in a new store.
 
         Args:
             budget: views drawn in the whole run, one a step: several a step are for more training than this.
             training: options of TrainingConfig.
         """
-        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": start.sh_degree, "batch": 1}
+        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": SH_DEGREE, "batch": 1}
         config = TrainingConfig(**{**usual, "seed": self.seed, **training})
-        tree = tree or build_kd(start.means, blocks)
-        if method == "abcd-monolithic":
-            tree = build_kd(start.means, 1)
-        start = thin_out(start, config.density.limit, config.seed)
-        store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
-        warms = config.warmup > 0 and tree.num_blocks > 1
-        largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
-        keep = coarse_model_size(config, largest, pixels) if warms else None
-        config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
-        store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        live = nothing_live(start.sh_degree)
-        return Coordinator(
-            TrainingRun(config, Budget(steps=budget), StoredScene(tree, store), views, self.rasterizer, *live)
-        )
+        blocks = 1 if method == "abcd-monolithic" else blocks
+        options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
+        folder = Path(tempfile.mkdtemp(dir=self._folder)) / STORE
+        live = nothing_live(SH_DEGREE)
+        builder = RunBuilder(options, stage.capture(SH_DEGREE), "cpu", say=lambda _: None)
+        return builder.build(folder, Budget(steps=budget), self.rasterizer, *live)
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train on a stage under the conditions of comparisons: as few views and Gaussians for every method.
@@ -147,8 +141,7 @@ class Lab:
         Args:
             options: of `coordinator`; they go before these.
         """
-        options = {"budget": BUDGET, "density": LIMITED, **options}
-        coordinator = self.coordinator(stage.start(), stage.views, method, **options)
+        coordinator = self.coordinator(stage, method, **{"density": LIMITED, **options})
         while not coordinator.finished:
             train_step(coordinator, stage)
         gaussians = merged(coordinator)
