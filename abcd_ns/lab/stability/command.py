@@ -35,7 +35,7 @@ def stability(
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
-    All methods draw the same number of views. OUT gets results.json and table.md. Needs no GPU and no data.
+    All methods take the same number of steps. OUT gets results.json and table.md. Needs no GPU and no data.
 
     Args:
         out: Folder for the results; absent, empty, or one of an earlier call.

@@ -37,7 +37,7 @@ SH_DEGREE = 1
 LIMITED = DensityConfig(max_gaussians=1000)
 """As many Gaussians for every method, and few, for time."""
 BUDGET = 600
-"""Views that a run draws where methods are compared: few, so that what blocks cost shows."""
+"""Steps of a run where methods are compared: few, so that what blocks cost shows."""
 BLOCKS = 4
 
 
@@ -123,10 +123,10 @@ class Lab:
         """A run that begins, in a new store.
 
         Args:
-            budget: views drawn in the whole run, one a step: several a step are for more training than this.
+            budget: steps of the whole run. Nearly all draw one view, as blocks are under-trained here.
             training: options of TrainingConfig.
         """
-        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": SH_DEGREE, "batch": 1}
+        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": SH_DEGREE}
         config = TrainingConfig(**{**usual, "seed": self.seed, **training})
         blocks = 1 if method == "abcd-monolithic" else blocks
         options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
@@ -136,7 +136,7 @@ class Lab:
         return builder.build(folder, Budget(steps=budget), self.rasterizer, *live)
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
-        """Train on a stage under the conditions of comparisons: as few views and Gaussians for every method.
+        """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.
 
         Args:
             options: of `coordinator`; they go before these.
