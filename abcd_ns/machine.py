@@ -83,7 +83,7 @@ def describe_versions() -> Versions:
 
 
 def without_home(text: str) -> str:
-    """Results are published: whose home folder it was is nobody's business."""
+    """The text with ~ in place of the home folder, since results are published."""
     home = str(Path.home())
     return text if home == "/" else re.sub(rf"(?<![\w.-]){re.escape(home)}(?![\w.-])", "~", text)
 

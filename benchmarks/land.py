@@ -15,8 +15,7 @@ from PIL import Image
 
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.synth.colmap_writer import write_model
-from abcd_ns.lab.synth.sparse_points import SparsePoints
+from abcd_ns.lab.synth.sparse_points import SparsePoints, write_model
 from abcd_ns.lab.world.land import Land, color_of
 from abcd_ns.lab.world.world import project
 

@@ -16,23 +16,19 @@ import torch
 import tyro
 from torch.profiler import ProfilerActivity
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
-from abcd_ns.engine.render import loss, make_rasterizer
+from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.render.loss import squared_errors
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
-from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import layers_of_visit
-from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage
+from abcd_ns.run.begin import RunBuilder
+from abcd_ns.run.options import RunOptions
 from benchmarks.runs import StageClock, print_machine, read_stage
 
 STAGES = (
@@ -67,24 +63,10 @@ class Args:
 def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    loss.warm_up(device)
-    rasterizer = make_rasterizer("auto", device)
-    rasterizer.warm_up()
-    start = gaussians_from_points(capture.points.float(), capture.colors)
-    tree = build_kd(start.means, blocks)
-    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-    keep = None if blocks == 1 else len(start) // blocks
-    store.commit(blocks_at_rest(tree, start, keep, args.seed))
-    run = TrainingRun(
-        TrainingConfig(seed=args.seed),
-        Budget(seconds=args.seconds),
-        StoredScene(tree, store),
-        capture.views,
-        rasterizer,
-        *nothing_live(3, device),
-        device=device,
-    )
-    return Coordinator(run)
+    options = RunOptions(TrainingConfig(seed=args.seed), blocks=blocks, workers=1)
+    builder = RunBuilder(options, capture.capture(3), device, say=lambda _: None)
+    rasterizer, budget = make_rasterizer("auto", device), Budget(seconds=args.seconds)
+    return builder.build(folder / "store", budget, rasterizer, *nothing_live(3, device))
 
 
 def run(

@@ -46,7 +46,7 @@ class VisitTask:
     poses: dict[str, str]
     """As in RunState; likewise."""
     beside: dict[int, float]
-    """By view that shows them, which part of the other blocks' weight is out at the same time; see
+    """By view that shows them, which part of the other blocks' weight is in flight at the same time; see
     shared_residual."""
     allowance: int | None
     """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
@@ -68,7 +68,7 @@ class VisitOutcome:
 
 @dataclass(frozen=True)
 class Parcel:
-    """An outcome on its way between processes: its tensors as arrays, which pickle hands over as they are."""
+    """An outcome on its way between processes: its tensors as arrays, which pickle does not copy."""
 
     outcome: VisitOutcome
     """Without its Gaussians."""
@@ -214,7 +214,7 @@ class Workers(ABC, Generic[M]):
 
     @abstractmethod
     def wait(self, seconds: float) -> list[Report]:
-        """What has happened, in order; waits for something so long at most.
+        """What has happened, in order; waits `seconds` at most.
 
         Raises:
             WorkersError: a worker cannot do its work, and no other could.

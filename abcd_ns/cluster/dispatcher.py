@@ -134,10 +134,10 @@ class Dispatcher(Coordinator):
         super().after_step(rendered, errors)
         self._counted = self.state.step
 
-    # -- lending -------------------------------------------------------------------------------------
+    # -- assigning -----------------------------------------------------------------------------------
 
     def _assign(self) -> None:
-        """Take in what may be, and lend as much as workers can take."""
+        """Take in the visits that are due, and begin as many as workers can take."""
         self._submit()
         steps = self.run.budget.steps
         while self.progress < 1.0 and (steps is None or self.state.planned < steps):
@@ -191,7 +191,7 @@ class Dispatcher(Coordinator):
         return self._shown[block][1]
 
     def _beside(self, active: ActiveVisit) -> dict[int, float]:
-        """By view, which part of the other blocks' weight is out at the same time: begun before, or next."""
+        """By view, which part of the other blocks' weight is in flight meanwhile: begun before, or next."""
         state, block = self.state, active.geometry.block
         others = {visit.active.geometry.block for visit in self._in_flight}
         others |= {plan.block for plan in state.queue[: self._lag - 1]}
@@ -199,7 +199,7 @@ class Dispatcher(Coordinator):
         return shown_beside(state.influence, block, others - {block}, blocks, active.views)
 
     def _allowance(self) -> int | None:
-        """The visit's part of what the scene's limit leaves: all that are out at once may grow."""
+        """The visit's part of what the scene's limit leaves: all visits in flight may grow."""
         limit = self.config.density.limit
         if limit is None:
             return None

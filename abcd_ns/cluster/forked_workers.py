@@ -1,6 +1,6 @@
 """Workers on the cores of this machine: for each visit a process is forked, which trains it and ends.
 
-Forking hands over everything: options, photos, kernels, and every block as it is at that moment. That works
+A fork has everything: options, photos, kernels, and every block as it is at that moment. That works
 where no GPU is in use and no thread pool has to be carried over, so a worker computes in a single thread. A
 step of a small block is some hundred short operations, which a second thread hardly makes faster.
 """
@@ -198,7 +198,7 @@ class _Telling:
 
 
 def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> NoReturn:
-    """All of a worker's life. Whatever goes wrong in it ends it, and who waits for it is told."""
+    """All that a worker's process does. Any error ends it, after it was reported."""
     status = 1
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -28,7 +28,7 @@ from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 
 FAINT = 0.01
-"""Weight that a block is given in every pixel: where nobody shows, nobody else needs to be waited for."""
+"""Weight that a block is given in every pixel, so that shares exist where no block shows."""
 ROOM = 10 / 26
 """Of the room for layers, for pictures that visits begin with: 5 numbers a pixel, where F and B have 8."""
 
@@ -50,11 +50,11 @@ def shares(
 def shown_beside(
     influence: Influence, block: int, others: Collection[int], blocks: int, views: Sequence[int]
 ) -> dict[int, float]:
-    """By view, which part of the other blocks' weight is of those that are out at the same time; views that
-    show none of these are left out.
+    """By view, which part of the other blocks' weight is in flight at the same time; views that show none of
+    these are left out.
 
     Args:
-        others: blocks that are out.
+        others: blocks in flight.
         blocks: how many there are. Where influences are not known, all weigh the same.
     """
     found = {}
@@ -74,8 +74,8 @@ class SharedResidual:
     """The pictures that a visit begins with, and what its block is to add to them.
 
     Args:
-        own: gives the block as others draw it, who do not see what joins it in this visit.
-        beside: by view, which part of the other blocks' weight is out at the same time.
+        own: gives the block as others draw it: without what joins it in this visit.
+        beside: by view, which part of the other blocks' weight is in flight at the same time.
         room: for pictures. What has none is drawn again when it is asked for.
     """
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import psutil
 import torch
+from cachetools import LRUCache
 from jaxtyping import Bool, Num, UInt8
 from PIL import Image
 from torch import Tensor
@@ -73,18 +74,20 @@ class Photos:
     def __init__(self, sources: Sequence[PhotoSource], budget_bytes: int | None = None):
         self.sources = tuple(sources)
         self.budget_bytes = default_budget() if budget_bytes is None else budget_bytes
-        self.cached_bytes = 0
-        """Of decoded pixels that are kept now; at most the budget."""
         largest = max((3 * source.size[0] * source.size[1] for source in self.sources), default=1)
         self._ahead = max(FEWEST_AHEAD, self.budget_bytes // (8 * largest))
         self._readers = ThreadPoolExecutor(READERS, "photos")
         self._lock = threading.Lock()
-        self._kept: OrderedDict[_Key, Tensor] = OrderedDict()
-        """Least recently used ones go first."""
+        self._kept: LRUCache[_Key, Tensor] = LRUCache(self.budget_bytes, getsizeof=lambda kept: kept.nbytes)
         self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.sources)
+
+    @property
+    def cached_bytes(self) -> int:
+        """Of decoded pixels that are kept now; at most the budget."""
+        return self._kept.currsize
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
         """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it.
@@ -132,18 +135,13 @@ class Photos:
     def _get(self, key: _Key) -> Tensor:
         with self._lock:
             if key in self._kept:
-                self._kept.move_to_end(key)
                 return self._kept[key]
             expected = self._expected.pop(key, None)
         # Not under the lock, so that two threads may both read one.
         value = self._read(key) if expected is None else expected.result()
         with self._lock:
-            if value.nbytes <= self.budget_bytes and key not in self._kept:
+            if value.nbytes <= self.budget_bytes:
                 self._kept[key] = value
-                self.cached_bytes += value.nbytes
-            while self.cached_bytes > self.budget_bytes:
-                _, oldest = self._kept.popitem(last=False)
-                self.cached_bytes -= oldest.nbytes
         return value
 
 

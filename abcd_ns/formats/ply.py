@@ -40,7 +40,7 @@ def rows(gaussians: Gaussians) -> np.ndarray:
 
 
 def header(count: int, sh_degree: int) -> bytes:
-    """What stands before the rows of so many Gaussians."""
+    """What comes before the rows of `count` Gaussians."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}", f"element vertex {count}"]
     lines += [f"property float {name}" for name in columns(sh_degree)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")

@@ -1,4 +1,4 @@
-"""The formats of an exported scene, chosen by the file's suffix."""
+"""The formats of an exported scene, chosen by the file's suffix, and how large its files would be."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,14 +11,17 @@ from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import write_glb
-from abcd_ns.formats.packed import check_installed, packed
-from abcd_ns.formats.ply import write_ply
+from abcd_ns.formats.packed import BYTES_AT_ONCE, check_installed, packed
+from abcd_ns.formats.ply import columns, header, write_ply
 
 PACKED = (".compressed.ply", ".spz", ".sog")
 SUFFIXES = (*PACKED, ".ply", ".glb")
 """The longer of two that fit comes first."""
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 """What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
+
+MOST_AT_ONCE = 4 * 2**30 // BYTES_AT_ONCE
+"""Gaussians that are packed only to see how small they become: 4 GiB of RAM."""
 
 
 def shows(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, "n"]:
@@ -88,3 +91,22 @@ def _counted(parts: Iterable[Gaussians], count: int) -> Iterator[Gaussians]:
         written += len(part)
     if written != count:
         raise RuntimeError(f"{written} Gaussians were written where {count} were announced")
+
+
+def ply_bytes(gaussians: Gaussians) -> int:
+    """Of the .ply that `abcd export` writes."""
+    degree, count = gaussians.sh_degree, int(shows(gaussians.opacities).sum())
+    return len(header(count, degree)) + 4 * len(columns(degree)) * count
+
+
+def spz_bytes(gaussians: Gaussians) -> int | None:
+    """Of the .spz that `abcd export --frame nerfstudio` writes; None where there is none: gaussforge is not
+    there, or nothing to pack, or more than MOST_AT_ONCE."""
+    kept = gaussians[shows(gaussians.opacities)]
+    if not 0 < len(kept) <= MOST_AT_ONCE:
+        return None
+    try:
+        check_installed()
+        return len(packed(len(kept), kept.sh_degree, "spz", [kept]))
+    except UserError:
+        return None

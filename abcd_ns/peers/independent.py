@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -43,8 +44,6 @@ from abcd_ns.engine.train.schedule import plan_epoch
 from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
 
-MOST_SORTED = 1 << 24
-"""Numbers of which torch finds a quantile, at most."""
 SURFACE_OPACITY = 0.9
 """Of the initial points where they stand for surfaces."""
 SURFACE_SCALE = 0.5
@@ -74,8 +73,7 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
     """
     extent = cell.upper - cell.lower
     if len(means):
-        some = means[:: 1 + len(means) // MOST_SORTED].double().cpu()
-        low, high = some.quantile(some.new_tensor([0.05, 0.95]), dim=0)
+        low, high = torch.from_numpy(np.quantile(means.double().cpu().numpy(), (0.05, 0.95), axis=0))
         extent = torch.where(extent.isinf(), high - low, extent)
     margin = overlap * torch.where(extent.isinf(), 0.0, extent)
     return Box(cell.lower - margin, cell.upper + margin)

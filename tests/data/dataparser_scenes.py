@@ -1,8 +1,11 @@
 """Small scenes as users have them, written through pycolmap, and how a parser is asked about them."""
 
+import io
 import json
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -114,3 +117,13 @@ def write_transforms(scene: Path, **extra) -> dict:
     meta = {"ply_file_path": "points.ply", "applied_transform": Z_UP.tolist(), "frames": frames, **extra}
     (scene / "transforms.json").write_text(json.dumps(meta))
     return meta
+
+
+def png_that_claims(size: tuple[int, int], mode: str = "RGB", depth: int = 8) -> bytes:
+    """A small PNG whose header names a size and a number of bits a channel."""
+    file = io.BytesIO()
+    Image.new(mode, (4, 4)).save(file, format="PNG")
+    data = bytearray(file.getvalue())
+    struct.pack_into(">IIB", data, 16, *size, depth)
+    struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))  # the checksum covers them
+    return bytes(data)

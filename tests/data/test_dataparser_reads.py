@@ -164,12 +164,6 @@ def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
     assert parser(scene, downscale_factor=4).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 4
 
 
-def test_scene_without_points_starts_at_random(tmp_path, capsys):
-    write_capture(tmp_path, points=0)
-    assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
-    assert "no points" in capsys.readouterr().out
-
-
 def test_photos_without_pose_are_mentioned(scene, capsys):
     Image.new("RGB", (9, 9)).save(scene / "images/extra.png")
     parser(scene).get_dataparser_outputs()

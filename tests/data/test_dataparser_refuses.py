@@ -5,7 +5,6 @@ import math
 import os
 import shutil
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tests.data.dataparser_scenes import (
     NAMES,
     REAL,
     SIZES,
+    png_that_claims,
     refusal,
     write_capture,
     write_model,
@@ -136,28 +136,9 @@ def test_name_that_leaves_the_photo_folder_is_refused(tmp_path):
 # Photos
 
 
-def _png_16(path: Path) -> None:
-    """16-bit RGB, which Pillow reads but cannot write: patch the depth in the header of an 8-bit file."""
-    Image.new("RGB", SIZES[0]).save(path)
-    data = bytearray(path.read_bytes())
-    data[24] = 16
-    # The checksum covers the depth.
-    struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
-    path.write_bytes(data)
-
-
 def _tiff_16(path: Path) -> None:
     deep = cv2.imencode(".tif", np.full((*SIZES[0][::-1], 3), 40_000, np.uint16))[1]
     path.write_bytes(deep.tobytes())
-
-
-def _bomb(path: Path, width: int = 30_000, height: int = 20_000) -> None:
-    _png_16(path)
-    data = bytearray(path.read_bytes())
-    data[24] = 8
-    struct.pack_into(">II", data, 16, width, height)
-    struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
-    path.write_bytes(data)
 
 
 def _cut(path: Path) -> None:
@@ -198,10 +179,11 @@ def _turned(path: Path) -> None:
         (_cut_jpeg, "damaged"),
         (_fifo, "not a regular file"),
         (_dangling, "link to nothing"),
-        (_png_16, "8 bits"),
+        # 16-bit RGB, which Pillow reads but cannot write.
+        (lambda p: p.write_bytes(png_that_claims(SIZES[0], depth=16)), "8 bits"),
         (lambda p: Image.fromarray(np.zeros(SIZES[0][::-1], np.uint16)).save(p), "8 bits"),
         (lambda p: Image.new("CMYK", SIZES[0]).save(p, format="JPEG"), "CMYK"),
-        (_bomb, "500 Mpx"),
+        (lambda p: p.write_bytes(png_that_claims((30_000, 20_000))), "500 Mpx"),
         (lambda p: Image.new("RGB", (SIZES[0][0] + 1, SIZES[0][1])).save(p), "its camera is 61 x 41"),
         (_turned, "EXIF"),
     ],
@@ -217,7 +199,7 @@ def test_bad_photo_is_named_with_its_fault(scene, spoil, message):
 
 def test_photos_of_aerial_cameras_are_not_too_large(tmp_path):
     """150 megapixels, over what Pillow takes for an attack."""
-    _bomb(tmp_path / "photo.png", 14_204, 10_652)
+    (tmp_path / "photo.png").write_bytes(png_that_claims((14_204, 10_652)))
     assert read_header(tmp_path / "photo.png").size == (14_204, 10_652)
 
 

@@ -1,9 +1,6 @@
 """Faults rarer than a missing photo: each is one line, found before training, and all at once."""
 
-import io
 import json
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +13,19 @@ from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.data.scene import Lens
 from abcd_ns.data.undistort import undistortion
 from abcd_ns.nerfstudio.inspection import inspect
-from tests.data.dataparser_scenes import NAMES, SIZES, parser, refusal, write_capture, write_transforms
+from tests.data.dataparser_scenes import (
+    NAMES,
+    SIZES,
+    parser,
+    png_that_claims,
+    refusal,
+    write_capture,
+    write_transforms,
+)
 
 
 def rewrite(scene: Path, meta: dict) -> None:
     (scene / "transforms.json").write_text(json.dumps(meta))
-
-
-def png_that_claims(size: tuple[int, int]) -> bytes:
-    """A small PNG whose header names a size."""
-    file = io.BytesIO()
-    Image.new("L", (4, 4), 255).save(file, format="PNG")
-    data = bytearray(file.getvalue())
-    struct.pack_into(">II", data, 16, *size)
-    struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
-    return bytes(data)
 
 
 def check_refusal(scene: Path, **options) -> list[str]:
@@ -134,7 +129,7 @@ def test_masks_of_no_use_are_all_found_before_training(scene):
 def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
     """A picture of few bytes may fill all memory; Pillow warns of the first size and refuses the other."""
     mask = write_masks(scene)[0]
-    mask.write_bytes(png_that_claims(size))
+    mask.write_bytes(png_that_claims(size, "L"))
     decoded = []
     monkeypatch.setattr("abcd_ns.data.photos._decode", lambda path, _: decoded.append(path))
     assert check_refusal(scene) == [f"{mask} has more than 500 Mpx; reduce the mask."]

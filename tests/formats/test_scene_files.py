@@ -18,9 +18,10 @@ from scipy.spatial import cKDTree
 
 from abcd_ns.cli.export.command import export
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import EXTENSION, Z_TO_Y, write_glb
-from abcd_ns.formats.scene_file import SUFFIXES, suffix_of, write_scene
+from abcd_ns.formats.scene_file import SUFFIXES, ply_bytes, spz_bytes, suffix_of, write_scene
 from tests.cli.test_export import FRAME, run, scene  # noqa: F401
 from tests.reference.scenes import random_gaussians
 
@@ -248,3 +249,30 @@ def test_spz_says_where_it_is_too_coarse_or_too_small(run, tmp_path, capsys):  #
     with pytest.raises(UserError, match="reaches 2048 units"):
         export(run, out=tmp_path / "huge-parts.spz", by_block=True)
     assert not list(tmp_path.glob("huge*"))
+
+
+# -- sizes ---------------------------------------------------------------------------------------------
+
+SIZES = {".ply": ply_bytes, ".spz": spz_bytes}
+
+
+@pytest.mark.parametrize("suffix", SIZES)
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_a_file_is_as_large_as_foretold(suffix, sh_degree, tmp_path):
+    gaussians = random_gaussians(300, sh_degree=sh_degree, seed=1)
+    path = write(tmp_path / f"scene{suffix}", gaussians, suffix)
+    assert SIZES[suffix](gaussians) == path.stat().st_size
+
+
+@pytest.mark.parametrize("suffix", SIZES)
+def test_who_shows_nowhere_takes_no_room(suffix):
+    shown = random_gaussians(300, sh_degree=3, seed=1)
+    hidden = Gaussians(**{**dict(shown.items()), "opacities": torch.full_like(shown.opacities, -9.0)})
+    assert SIZES[suffix](Gaussians.cat([shown, hidden])) == SIZES[suffix](shown)
+
+
+def test_what_cannot_be_packed_has_no_size(monkeypatch):
+    gaussians = random_gaussians(10, sh_degree=1, seed=1)
+    assert spz_bytes(gaussians[:0]) is None
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    assert spz_bytes(gaussians) is None

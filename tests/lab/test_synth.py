@@ -170,9 +170,9 @@ def test_settings_out_of_range_name_their_flag(tmp_path: Path, name: str, value:
 def test_gates_can_be_walked_through() -> None:
     """A line through the middle of a shared gate meets nothing before the far court; one above it does."""
     site = Site.plan(2, "row", seed=2)
-    world, gate = build_world(site), site.openings(0, 3, True)[0]
+    world, gate = build_world(site), site.gate(0, 3, True)
     assert site.walls(0)[-1] == (3, True)
     assert len(site.walls(1)) == 3
-    start, east = torch.tensor([[-1.2], [-gate.center], [1.2]]), torch.tensor([[1.0], [0.0], [0.0]])
+    start, east = torch.tensor([[-1.2], [-gate], [1.2]]), torch.tensor([[1.0], [0.0], [0.0]])
     assert not bool(world.blocked(start, east, 2.4))
     assert bool(world.blocked(start + torch.tensor([[0.0], [0.0], [1.9]]), east, 2.4))

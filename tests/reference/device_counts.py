@@ -48,12 +48,6 @@ class Counts:
         }
         return Counts(**{**values, **less})
 
-    def plus(self, other: "Counts") -> "Counts":
-        """Both together; the larger peak."""
-        names = [f.name for f in fields(self) if f.name not in ("live_bytes", "peak_bytes")]
-        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        return Counts(**sums, live_bytes=other.live_bytes, peak_bytes=max(self.peak_bytes, other.peak_bytes))
-
     def reset_peak(self) -> None:
         """Count the peak anew from here."""
         self.peak_bytes = self.live_bytes

@@ -1,6 +1,7 @@
 """What a step on a device waits for and copies, and what it tells a step late."""
 
 import math
+from unittest import mock
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
-from benchmarks.device import Watch
+from tests.reference.device_counts import Counts
 from tests.reference.rasterizer_scenes import as_leaves
 from tests.reference.scenes import STILL, listen, random_gaussians, ring_of_views, whole_scene
 from tests.reference.simulated_device import DEVICE
@@ -25,15 +26,39 @@ from tests.reference.simulated_device import DEVICE
 GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0)
 
 
+def steps_alone(coordinator, photos, counts: Counts) -> list[Counts]:
+    """What is counted in each step, but for visits' beginnings and ends."""
+    found, edges = [], []
+
+    def noting(method):
+        def noted(*args):
+            before = counts.copy()
+            result = method(*args)
+            edges.append(counts.since(before))
+            return result
+
+        return noted
+
+    noted = {name: noting(getattr(coordinator, name)) for name in ("begin_visit", "end_visit")}
+    with mock.patch.multiple(coordinator, **noted):
+        while not coordinator.finished:
+            edges.clear()
+            before = counts.copy()
+            train_step(coordinator, photos)
+            taken = counts.since(before)
+            for edge in edges:
+                taken = taken.since(edge)
+            found.append(taken)
+    return found
+
+
 @pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (4, 0), (4, 300)])
 def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, blocks, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
     coordinator = on_device(blocks=blocks, steps=3 * blocks, density=GATHERING, crop_pixels=parts)
-    watch = Watch(simulated_gsplat)
-    with watch.watching(coordinator):
-        while not coordinator.finished:
-            watch.take_step(coordinator, photos)
-    for taken in watch.steps[1:]:  # the first one uploads cameras and backgrounds
+    for taken in steps_alone(coordinator, photos, simulated_gsplat)[
+        1:
+    ]:  # the first one uploads cameras and backgrounds
         apart = taken.waits.pop("isect_tiles")
         assert apart == 1
         assert dict(+taken.waits) in ({}, {"event": 1}), taken.places

@@ -24,7 +24,7 @@ from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
-from abcd_ns.formats.sizes import MOST_AT_ONCE, ply_bytes, spz_bytes
+from abcd_ns.formats.scene_file import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config

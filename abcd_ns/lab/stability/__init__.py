@@ -1,4 +1,4 @@
 """`abcd stability`: where methods fail, small scenes that make them, and what ABCD does there.
 
-`lab` trains; `training` and `captures` have the ways to fail.
+`lab` trains; `scenarios` has the ways to fail.
 """

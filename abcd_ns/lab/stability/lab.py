@@ -1,39 +1,33 @@
-"""What a scenario is; small scenes trained with the bare engine, the same way for every method."""
+"""What a scenario is; small scenes trained without nerfstudio, the same way for every method."""
 
-import math
 import tempfile
-from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.space.distances import as_trained
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
-from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import coarse_model_size
-from abcd_ns.engine.train.planner import views_of_step
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.schedule import views_per_step, warm_up_is_over
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
+from abcd_ns.run import STORE
+from abcd_ns.run.begin import Capture, RunBuilder
+from abcd_ns.run.options import RunOptions
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
@@ -43,7 +37,7 @@ SH_DEGREE = 1
 LIMITED = DensityConfig(max_gaussians=1000)
 """As many Gaussians for every method, and few, for time."""
 BUDGET = 600
-"""Views that a run draws where methods are compared: few, so that what blocks cost shows."""
+"""Steps of a run where methods are compared: few, so that what blocks cost shows."""
 BLOCKS = 4
 
 
@@ -65,9 +59,15 @@ class Stage:
         """The training loop's photo reader."""
         return self.photos[index][crop.slices]
 
-    def start(self) -> Gaussians:
-        """The first Gaussians."""
-        return gaussians_from_points(self.points.float(), self.colors, sh_degree=SH_DEGREE)
+    def target(self, sample: Sample) -> Target:
+        """What a sample is trained on, without a mask."""
+        return sample.reduced(self(sample.view.index, sample.source)), None
+
+    def capture(self, sh_degree: int) -> Capture:
+        """What a run of this degree is trained on; it begins with a Gaussian for each point."""
+        names = [Path(str(view.index)) for view in self.views]
+        start = partial(gaussians_from_points, self.points.float(), self.colors, sh_degree=sh_degree)
+        return Capture(self.views, names, self.target, start, len(self.points))
 
     def only(self, count: int) -> "Stage":
         """With `count` of the training views, evenly spread."""
@@ -90,20 +90,13 @@ def make_stage(
     return Stage(views, photos, where, colors, held_out, [world.photo(view) for view in held_out])
 
 
-@dataclass
-class Trained:
+class Trained(NamedTuple):
     """What a run left behind."""
 
-    coordinator: Coordinator
+    gaussians: Gaussians
+    """The whole scene in one list."""
     psnr: float
     """Held-out, dB."""
-    counts: list[int]
-    """Gaussians in the scene after each step."""
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The whole scene in one list."""
-        return merged(self.coordinator)
 
 
 class Lab:
@@ -115,85 +108,50 @@ class Lab:
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
         self.seed, self._folder, self.rasterizer = seed, folder, TorchRasterizer()
-        self._scores: dict[tuple[str, Method], float] = {}
+        self._scores: dict[Method, float] = {}
 
     def coordinator(
         self,
-        start: Gaussians,
-        views: list[View],
+        stage: Stage,
         method: Method = "abcd",
         *,
-        budget: int,
+        budget: int = BUDGET,
         blocks: int = BLOCKS,
-        tree: BlockTree | None = None,
+        partition: Literal["kd", "grid"] = "kd",
         **training: Any,
     ) -> Coordinator:
-        """A coordinator over a new store.
+        """A run that begins, in a new store.
 
         Args:
-            budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
+            budget: steps of the whole run. Nearly all draw one view, as blocks are under-trained here.
             training: options of TrainingConfig.
         """
-        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": start.sh_degree}
+        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": SH_DEGREE}
         config = TrainingConfig(**{**usual, "seed": self.seed, **training})
-        tree = tree or build_kd(start.means, blocks)
-        if method == "abcd-monolithic":
-            tree = build_kd(start.means, 1)
-        start = thin_out(start, config.density.limit, config.seed)
-        store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
-        warms = config.warmup > 0 and tree.num_blocks > 1
-        largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
-        keep = coarse_model_size(config, largest, pixels) if warms else None
-        config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
-        store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        deferred = 0 if keep is None else max(len(start) - keep, 0)
-        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), deferred))
-        live = nothing_live(start.sh_degree)
-        return Coordinator(
-            TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live)
-        )
+        blocks = 1 if method == "abcd-monolithic" else blocks
+        options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
+        folder = Path(tempfile.mkdtemp(dir=self._folder)) / STORE
+        live = nothing_live(SH_DEGREE)
+        builder = RunBuilder(options, stage.capture(SH_DEGREE), "cpu", say=lambda _: None)
+        return builder.build(folder, Budget(steps=budget), self.rasterizer, *live)
 
-    def train(
-        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options: Any
-    ) -> Trained:
-        """Train on a stage from its points, or from `start`, and score the held-out views.
-
-        Args:
-            options: of `coordinator`.
-        """
-        start = stage.start() if start is None else start
-        coordinator = self.coordinator(start, stage.views, method, **options)
-        counts = self.finish(coordinator, stage)
-        return Trained(coordinator, self.score(coordinator, stage), counts)
-
-    def train_limited(self, stage: Stage, method: Method, **options: Any) -> Trained:
-        """Train under the conditions of comparisons: on few views and with few Gaussians, as many of both for
-        every method.
+    def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
+        """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.
 
         Args:
             options: of `coordinator`; they go before these.
         """
-        return self.train(stage, method, **{"budget": BUDGET, "density": LIMITED, **options})
-
-    def compared(self, stage: Stage, method: Method, name: str | None = None, **options: Any) -> float:
-        """Held-out PSNR under the conditions of comparisons, dB.
-
-        Args:
-            name: of the stage; its score is kept, and not found anew where nothing else is said.
-        """
-        if name is None or options:
-            return self.train_limited(stage, method, **options).psnr
-        if (name, method) not in self._scores:
-            self._scores[name, method] = self.train_limited(stage, method).psnr
-        return self._scores[name, method]
-
-    def finish(self, coordinator: Coordinator, stage: Stage) -> list[int]:
-        """Train on until the budget is used up; the number of Gaussians after each step."""
-        counts: list[int] = []
+        coordinator = self.coordinator(stage, method, **{"density": LIMITED, **options})
         while not coordinator.finished:
             train_step(coordinator, stage)
-            counts.append(coordinator.count())
-        return counts
+        gaussians = merged(coordinator)
+        return Trained(gaussians, self.score(gaussians, stage))
+
+    def score_of_table(self, method: Method) -> float:
+        """Held-out PSNR on the table, dB; trained once for all scenarios."""
+        if method not in self._scores:
+            self._scores[method] = self.train(make_stage(), method).psnr
+        return self._scores[method]
 
     @torch.no_grad()
     def pictures(self, gaussians: Gaussians, views: list[View]) -> list[Float[Tensor, "h w 3"]]:
@@ -201,52 +159,10 @@ class Lab:
         degree = gaussians.sh_degree
         return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
 
-    def score(self, coordinator: Coordinator, stage: Stage) -> float:
+    def score(self, gaussians: Gaussians, stage: Stage) -> float:
         """Mean PSNR of merged pictures of the held-out views, dB."""
-        drawn = self.pictures(merged(coordinator), stage.held_out)
+        drawn = self.pictures(gaussians, stage.held_out)
         return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
-
-    def error(self, coordinator: Coordinator, stage: Stage) -> float:
-        """The full objective, near enough: the mean absolute error over all training photos."""
-        drawn = self.pictures(merged(coordinator), stage.views)
-        errors = [(a - stage.photos[v.index]).abs().mean() for a, v in zip(drawn, stage.views, strict=True)]
-        return float(torch.stack(errors).mean())
-
-
-def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, deferred: int = 0) -> int:
-    """Steps that draw about so many views of `views`, in the warm-up and after it.
-
-    Args:
-        deferred: Gaussians that have no room in the warm-up.
-    """
-    batch_warm = views_per_step(config.batch, 1)
-
-    def drawn_in(steps: int) -> int:
-        if blocks == 1:
-            return steps * batch_warm
-        if config.warmup == 0:
-            return drawn_by_blocks(steps, config, blocks, 0)
-        uses, share = batch_warm / views, config.warmup
-        taken = range(1, steps)
-        is_over = (warm_up_is_over(step / steps, step * uses, share, deferred) for step in taken)
-        warm = next((step for step, over in zip(taken, is_over, strict=True) if over), steps)
-        return warm * batch_warm + drawn_by_blocks(steps - warm, config, blocks, warm * batch_warm)
-
-    return max(bisect_left(range(drawn + 1), drawn, key=drawn_in), 1)
-
-
-def drawn_by_blocks(steps: int, config: TrainingConfig, blocks: int, trained: int) -> int:
-    """Views that so many steps draw, which blocks take in turn.
-
-    Args:
-        trained: views that each of them was trained on before.
-    """
-    drawn = 0
-    for taken in range(0, steps, blocks):
-        batch = views_of_step(config, blocks, trained)
-        drawn += batch * min(steps - taken, blocks)
-        trained += batch
-    return drawn
 
 
 def merged(coordinator: Coordinator) -> Gaussians:

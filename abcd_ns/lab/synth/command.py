@@ -17,12 +17,11 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_json, write_json
 from abcd_ns.lab.runs.runner import say, take_folder, taking
-from abcd_ns.lab.synth.colmap_writer import write_model
-from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
+from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points, write_model
 from abcd_ns.lab.world.court import Layout, Site, build_world, court_cameras
 from abcd_ns.progress_bar import ProgressBar
 
-FORMAT = 3
+FORMAT = 4
 """Raised whenever the same settings would draw another scene."""
 MARKER = "synth.json"
 LIMITS = {

@@ -1,10 +1,13 @@
-"""Scene points with their observations, as a structure-from-motion run would leave them."""
+"""Scene points with their observations, as structure from motion would leave them, and the model of these."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from abcd_ns.engine.types import View
@@ -92,3 +95,32 @@ def _observe(world: SunlitWorld, view: View, xyz: Tensor) -> tuple[NDArray[np.bo
     rays = (xyz[visible] - view.center).T.float()
     visible[visible.clone()] = ~world.blocked(view.center.float()[:, None], rays, 1 - _SLACK)
     return visible.numpy(), xy.numpy()
+
+
+def write_model(folder: Path, cameras: dict[str, View], points: SparsePoints) -> None:
+    """Write cameras.bin, images.bin and points3D.bin with one shared pinhole camera, by the writer that
+    nerfstudio has of COLMAP's own.
+
+    Ids count from 1: image i is the i-th of `cameras`, by its file's name; point j is row j - 1 of `points`.
+    Stored errors are 0, because observations are exact projections.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    order = np.lexsort((points.point, points.camera))
+    rows = np.searchsorted(points.camera[order], np.arange(len(cameras) + 1))
+    slot = np.empty(len(order), np.int64)
+    slot[order] = np.arange(len(order)) - rows[points.camera[order]]
+    images, tracks = {}, {}
+    for i, (name, view) in enumerate(cameras.items()):
+        mine = order[rows[i] : rows[i + 1]]
+        turn = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
+        pose = turn[[3, 0, 1, 2]], view.viewmat[:3, 3]
+        images[i] = colmap.Image(i + 1, *pose, 1, name, points.xy[mine], points.point[mine] + 1)
+    by_point = np.lexsort((points.camera, points.point))
+    ends = np.searchsorted(points.point[by_point], np.arange(len(points.xyz) + 1))
+    for j, (xyz, rgb) in enumerate(zip(points.xyz, points.rgb, strict=True)):
+        track = by_point[ends[j] : ends[j + 1]]
+        tracks[j] = colmap.Point3D(j + 1, xyz, rgb, 0.0, points.camera[track] + 1, slot[track])
+    view = next(iter(cameras.values()))
+    (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
+    shared = colmap.Camera(1, "PINHOLE", view.width, view.height, (fx, fy, cx, cy))
+    colmap.write_model({1: shared}, images, tracks, folder)

@@ -2,7 +2,6 @@
 
 import math
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -38,28 +37,13 @@ STYLES: tuple[tuple[Color, Color, Color, tuple[float, float]], ...] = (
     ((0.62, 0.56, 0.44), (0.40, 0.36, 0.29), (0.55, 0.46, 0.32), (0.80, 0.40)),
     ((0.24, 0.29, 0.34), (0.36, 0.36, 0.35), (0.34, 0.38, 0.41), (0.80, 0.36)),
 )
-ACCENTS: tuple[Color, ...] = (
-    (0.48, 0.05, 0.05), (0.05, 0.13, 0.42), (0.55, 0.36, 0.04), (0.05, 0.27, 0.12), (0.30, 0.06, 0.30),
-)  # fmt: skip
 DARK: Color = (0.07, 0.045, 0.03)
 OAK = Material("blocks", (0.32, 0.19, 0.09), DARK, (0.45, 0.30, 0.16), (0.16, 2.0))
-IRON = Material("clouds", *[(0.10, 0.10, 0.11)] * 3)
 MARBLE = Material("clouds", (0.62, 0.60, 0.55), (0.36, 0.36, 0.35), (0.48, 0.44, 0.40))
 TILES = Material("blocks", (0.38, 0.16, 0.09), DARK, (0.50, 0.25, 0.14), (0.28, 0.24))
 WATER = Material("clouds", (0.05, 0.17, 0.20), (0.05, 0.17, 0.20), (0.13, 0.33, 0.36))
-CLAY = Material("clouds", (0.45, 0.20, 0.11), (0.30, 0.12, 0.07), (0.52, 0.27, 0.16))
 LEAVES = Material("clouds", (0.11, 0.20, 0.04), (0.02, 0.05, 0.015), (0.25, 0.34, 0.07), (0.4, 1.0))
-GRASS = Material("meadow", *[(0.15, 0.25, 0.06)] * 3)
-
-Make = Callable[[np.random.Generator], list[Solid]]
-
-
-def barrel(rng: np.random.Generator) -> list[Solid]:
-    """A cask with iron hoops."""
-    r, h = rng.uniform(0.32, 0.4), rng.uniform(0.85, 1.0)
-    ends = [block((-1, -1, z), (1, 1, z + 1), OAK) for z in (-1.0, h)]
-    cask = replace(ball((0, 0, h / 2), r, OAK, 0.9 * h), holes=tuple(ends))
-    return [cask, *(tube(0.97 * r, z - 0.04, z + 0.04, IRON) for z in (0.25 * h, 0.75 * h))]
+GRASS = Material("clouds", (0.24, 0.27, 0.08), (0.12, 0.16, 0.04), (0.10, 0.22, 0.045), (3.0, 1.0))
 
 
 def crates(rng: np.random.Generator) -> list[Solid]:
@@ -69,11 +53,6 @@ def crates(rng: np.random.Generator) -> list[Solid]:
     return [block((-a, -a, 0), (a, a, 2 * a), OAK), top]
 
 
-def urn(rng: np.random.Generator) -> list[Solid]:
-    """A clay pot with a bush."""
-    return [ball((0, 0, 0.35), 0.4, CLAY), tube(0.36, 0.6, 0.74, CLAY), *_leaves(rng, 0.45, 0.95, 2)]
-
-
 def bench(rng: np.random.Generator) -> list[Solid]:  # noqa: ARG001 - all are alike
     """A plank on two stones."""
     legs = [block((x - 0.1, -0.2, 0), (x + 0.1, 0.2, 0.42), MARBLE) for x in (-0.6, 0.6)]
@@ -81,26 +60,14 @@ def bench(rng: np.random.Generator) -> list[Solid]:  # noqa: ARG001 - all are al
 
 
 def bush(rng: np.random.Generator) -> list[Solid]:
-    """A low shrub."""
-    return _leaves(rng, 0.55, 0.35, 3)
-
-
-def _leaves(rng: np.random.Generator, radius: float, z: float, count: int) -> list[Solid]:
-    """Clumps of leaves about a height, each the size of half the whole, or somewhat more."""
+    """Four clumps of leaves."""
     clump = replace(LEAVES, salt=float(rng.integers(60)))
-    parts = [ball((0, 0, z), 0.8 * radius, clump)]
-    for k in range(count):
-        angle, r = 2 * np.pi * k / count + rng.uniform(0, 1), radius * rng.uniform(0.5, 0.7)
-        at = (
-            0.5 * radius * np.cos(angle),
-            0.5 * radius * np.sin(angle),
-            z + rng.uniform(-0.1, 0.25) * radius,
-        )
-        parts.append(ball(at, r, clump, rng.uniform(0.75, 1) * r))
-    return parts
+    angles = 2 * np.pi * np.arange(3) / 3 + rng.uniform(0, 1, 3)
+    sides = [ball((0.28 * np.cos(a), 0.28 * np.sin(a), 0.4), rng.uniform(0.27, 0.38), clump) for a in angles]
+    return [ball((0, 0, 0.35), 0.45, clump), *sides]
 
 
-def fountain(rng: np.random.Generator, accent: Material) -> list[Solid]:  # noqa: ARG001 - all are alike
+def fountain() -> list[Solid]:
     """Two bowls with water about a stem, a ball on top."""
     bowl = replace(ball((0, 0, 1.42), 0.8, MARBLE, 0.4), holes=(block((-1, -1, 1.42), (1, 1, 2), MARBLE),))
     return [
@@ -112,17 +79,8 @@ def fountain(rng: np.random.Generator, accent: Material) -> list[Solid]:  # noqa
         tube(0.8, 1.36, 1.46, MARBLE, tube(0.68, 1.3, 1.5, MARBLE)),
         tube(0.69, 1.3, 1.425, WATER),
         tube(0.11, 1.4, 1.85, MARBLE),
-        ball((0, 0, 2.0), 0.2, accent),
+        ball((0, 0, 2.0), 0.2, TILES),
     ]
-
-
-def tree(rng: np.random.Generator, accent: Material) -> list[Solid]:  # noqa: ARG001 - as the fountain
-    """A trunk in a stone ring with a crown of several clumps."""
-    bark = Material("blocks", (0.20, 0.14, 0.09), DARK, (0.30, 0.22, 0.14), (0.2, 2.0))
-    ring = tube(1.05, 0, 0.4, MARBLE, tube(0.85, 0.1, 0.5, MARBLE))
-    crown = [leaf.placed((0.55 * x, 0.55 * y, 0)) for x, y in ((1, 0), (-0.5, 0.9), (-0.5, -0.9))
-             for leaf in _leaves(rng, 0.9, rng.uniform(2.3, 2.9), 2)]  # fmt: skip
-    return [ring, tube(0.86, 0.1, 0.32, GRASS), tube(0.2, 0.3, 2.4, bark), *crown]
 
 
 def tower(wall: Material, trim: Material, roofed: bool) -> list[Solid]:
@@ -137,39 +95,16 @@ def tower(wall: Material, trim: Material, roofed: bool) -> list[Solid]:
     return [*parts, tube(0.97, top + 0.2, top + 0.65, wall, tube(0.62, top + 0.2, top + 1, wall), *notches)]
 
 
-def shelter(rng: np.random.Generator) -> list[Solid]:
-    """A tiled lean-to, its high edge at y = 0, with what is kept under it."""
-    roof = Solid("block", (1.4, 0.62, 0.05), TILES, (0.0, -0.58, 2.25), turned(tilt=0.4))
-    posts = [block((x - 0.07, -1.05, 0), (x + 0.07, -0.91, 2.0), OAK) for x in (-1.3, 0.0, 1.3)]
-    kept = [(-0.75, barrel), (0.1, barrel), (0.95, crates)]
-    return [roof, *posts, *(part.placed((x, -0.55, 0)) for x, make in kept for part in make(rng))]
+FURNITURE = (crates, bench, bush)
 
 
-FURNITURE: tuple[Make, ...] = (barrel, crates, urn, bench, bush)
-CENTREPIECES = (fountain, tree)
-
-
-@dataclass(frozen=True)
-class Opening:
-    """A gate (sill 0) or window in a wall, with a round head."""
-
-    center: float
-    """Metres along the wall from its middle."""
-    width: float
-    sill: float = 0.0
-    """Height of the lower edge, metres."""
-    spring: float = 1.65
-    """Height where the arch begins, metres."""
-
-    def shape(self, material: Material, grow: float = 0.0, deep: float = 0.5) -> list[Solid]:
-        """What it leaves out of a wall along x, or a frame `grow` metres wider; both with half a depth."""
-        half, low = self.width / 2 + grow, self.sill - (0.01 if self.sill == 0 else grow)
-        across = turned(tilt=np.pi / 2)
-        center = (self.center, 0.0, self.spring)
-        return [
-            block((self.center - half, -deep, low), (self.center + half, deep, self.spring), material),
-            Solid("tube", (half, half, deep), material, center, across),
-        ]
+def gate(center: float, material: Material, grow: float = 0.0, deep: float = 0.5) -> list[Solid]:
+    """What a gate with a round head leaves out of a wall along x, or a frame `grow` metres wider."""
+    half = 1.1 + grow
+    return [
+        block((center - half, -deep, -0.01), (center + half, deep, 1.65), material),
+        Solid("tube", (half, half, deep), material, (center, 0.0, 1.65), turned(tilt=np.pi / 2)),
+    ]
 
 
 @dataclass(frozen=True)
@@ -217,16 +152,11 @@ class Site:
         beyond = [(column, row + 1), (column - 1, row), (column, row - 1), (column + 1, row)]
         return [(k, at in self.cells) for k, at in enumerate(beyond) if at not in self.cells or k in (0, 3)]
 
-    def openings(self, court: int, side: int, shared: bool) -> list[Opening]:
-        """Of a wall: a wide gate and two windows where a court lies beyond; else few."""
+    def gate(self, court: int, side: int, shared: bool) -> float | None:
+        """Where a wall has a gate, metres from its middle; each that parts two courts has one, others may."""
         rng = self.rng("edge", self.cells[court], side)
-        if shared:
-            gate = Opening(rng.uniform(-0.6, 0.6), rng.uniform(2.2, 2.6))
-            return [gate, *(Opening(s, rng.uniform(0.9, 1.15), 1.0, 1.85) for s in (-3.2, 3.2))]
-        sides = (-3.1, 3.1) if rng.random() < 0.5 else (float(rng.choice([-3.1, 3.1])),)
-        found = [Opening(s, rng.uniform(0.9, 1.15), 1.0, 1.85) for s in sides]
-        gate = Opening(rng.uniform(-0.4, 0.4), rng.uniform(1.7, 2.0))
-        return [gate, *found] if rng.random() < 0.5 else found
+        center = rng.uniform(-0.6, 0.6)
+        return center if shared or rng.random() < 0.5 else None
 
 
 def build_world(site: Site) -> SunlitWorld:
@@ -246,65 +176,46 @@ def build_court(site: Site, court: int) -> Thing:
     light = tuple(min(0.7, 0.35 + 0.5 * c) for c in base)
     wall = Material("blocks", base, mortar, third, size, float(rng.integers(60)))
     trim = Material("clouds", light, mortar, tuple(0.85 * c for c in light))
-    accent = Material("clouds", *[ACCENTS[(court * 2 + style) % len(ACCENTS)]] * 3)
     flags = Material(
-        "paving", (0.38, 0.35, 0.30), (0.16, 0.15, 0.10), (0.48, 0.44, 0.38), (1.1, 0.9), wall.salt
+        "blocks", (0.38, 0.35, 0.30), (0.16, 0.15, 0.10), (0.48, 0.44, 0.38), (1.1, 0.9), wall.salt
     )
     h = CELL / 2
     things = [Thing((block((-h, -h, -1.0), (h, h, 0.0), flags),))]
     for side, shared in site.walls(court):
-        openings = site.openings(court, side, shared)
-        parts = [Thing(tuple(_wall(openings, wall, trim))), *_beside(openings, accent, rng)]
-        things += [part.placed(yaw=side * np.pi / 2) for part in parts]
+        parts = _wall(site.gate(court, side, shared), wall, trim)
+        things.append(Thing(tuple(parts)).placed(yaw=side * np.pi / 2))
     for k, turn in enumerate(np.arange(4) * np.pi / 2):
         place, make = (INNER - 0.75, INNER - 0.75, 0.0), FURNITURE[rng.integers(len(FURNITURE))]
         corner = tower(wall, trim, roofed=k == 0) if k < 2 else make(rng)
         things.append(Thing(tuple(corner)).placed(place).placed(yaw=turn + wall.salt * np.pi / 2))
-    things.append(Thing(tuple(CENTREPIECES[(court + site.seed) % 2](rng, accent))))
+    things.append(Thing(tuple(fountain())))
     start = rng.uniform(0, np.pi / 2)
-    for k, which in enumerate(rng.integers(2, len(FURNITURE), 4)):
+    for k, which in enumerate(rng.integers(len(FURNITURE), size=4)):
         angle = start + k * np.pi / 2 + rng.uniform(-0.2, 0.2)
         at = (2.5 * np.cos(angle), 2.5 * np.sin(angle), 0.0)
         things.append(Thing(tuple(FURNITURE[which](rng))).placed(at, angle + np.pi / 2))
     return Thing(tuple(things)).placed(site.center(court))
 
 
-def _wall(openings: list[Opening], wall: Material, trim: Material) -> list[Solid | Thing]:
-    """The northern wall of a court at the origin: plinth, openings with frames, cornice, battlements."""
+def _wall(center: float | None, wall: Material, trim: Material) -> list[Solid]:
+    """The northern wall of a court at the origin: plinth, gate with a frame, cornice, battlements."""
     h, middle, pitch = CELL / 2, (0, CELL / 2, 0), CELL / 10
     low, high = (-h, INNER), (h, CELL - INNER)
-    cuts = [[hole.placed(middle) for hole in opening.shape(trim)] for opening in openings]
-    gates = [hole for cut, opening in zip(cuts, openings, strict=True) if opening.sill == 0 for hole in cut]
+
+    def gate_of(*size: float) -> list[Solid]:
+        return [] if center is None else [part.placed(middle) for part in gate(center, trim, *size)]
+
     notches = [
         block((x, -1, HEIGHT), (x + 0.42 * pitch, 1, HEIGHT + 1), wall).placed(middle)
         for x in pitch * np.arange(-5, 5)
     ]
-    parts = [
-        block((*low, 0), (*high, HEIGHT), wall, *(hole for cut in cuts for hole in cut)),
+    return [
+        block((*low, 0), (*high, HEIGHT), wall, *gate_of()),
         block((*low, HEIGHT), (*high, HEIGHT + 0.55), wall, *notches),
-        block((-h, INNER - 0.08, 0), (h, CELL - INNER + 0.08, 0.32), trim, *gates),
+        block((-h, INNER - 0.08, 0), (h, CELL - INNER + 0.08, 0.32), trim, *gate_of()),
         block((-h, INNER - 0.07, HEIGHT - 0.16), (h, CELL - INNER + 0.07, HEIGHT + 0.01), trim),
+        *(replace(frame, holes=tuple(gate_of())) for frame in gate_of(0.18, 0.36)),
     ]
-    for opening, cut in zip(openings, cuts, strict=True):
-        frames = (frame.placed(middle) for frame in opening.shape(trim, grow=0.18, deep=0.36))
-        parts.append(Thing(tuple(replace(frame, holes=tuple(cut)) for frame in frames)))
-    return parts
-
-
-def _beside(openings: list[Opening], accent: Material, rng: np.random.Generator) -> list[Thing]:
-    """Banners on both sides of a gate, or a shelter where the northern wall has none."""
-    gates = [opening for opening in openings if opening.sill == 0]
-    if not gates:
-        return [Thing(tuple(shelter(rng))).placed((0.0, INNER, 0))]
-    reach, found = gates[0].width / 2 + 0.85, []
-    for x in (gates[0].center - reach, gates[0].center + reach):
-        if all(abs(x - opening.center) > 1.0 for opening in openings):
-            cloth = Material("cloth", accent.base, (0.66, 0.62, 0.50), accent.base, (0.36, 1.0))
-            low = HEIGHT - 0.3 - rng.uniform(1.3, 1.7)
-            found.append(
-                Thing((block((x - 0.54, INNER - 0.14, low), (x + 0.54, INNER - 0.1, HEIGHT - 0.3), cloth),))
-            )
-    return found
 
 
 def court_cameras(site: Site, court: int, count: int, size: tuple[int, int]) -> list[View]:

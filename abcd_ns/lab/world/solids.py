@@ -74,7 +74,7 @@ class Solid:
     def meet(self, origins: Rays, directions: Rays) -> Float[Tensor, "n"]:
         """How far along each ray it is: behind the holes that are met before; FAR where it is not."""
         t, leave = self.span(origins, directions)
-        t = t.clamp_min(1e-4)  # who stands in a hole sees the hole
+        t = t.clamp_min(1e-4)  # rays may begin in a hole
         rows = (t < leave).nonzero()[:, 0] if self.holes else ()
         if len(rows):
             within = t[rows]

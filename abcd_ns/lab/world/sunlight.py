@@ -7,17 +7,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.lab.world.solids import Rays, Thing
-from abcd_ns.lab.world.textures import Colors, color, fbm, mix, smoothstep
+from abcd_ns.lab.world.textures import Colors, color, mix, smoothstep
 from abcd_ns.lab.world.world import FAR, Seen, World
 
 SUN = color((2.2, 1.98, 1.62))
 ZENITH, HORIZON, HAZE = color((0.16, 0.36, 0.85)), color((0.62, 0.76, 0.92)), color((0.55, 0.66, 0.72))
-CLOUD = color((1.3, 1.28, 1.26))
 BOUNCE = color((0.16, 0.14, 0.11))
 """What an average sunlit surface sends back."""
 SKYLIGHT = color((0.50, 0.60, 0.78))
-LARGE = 3.0
-"""Metres; what is larger is no ball that shades others."""
 LIFT = 5e-3
 """Metres from a surface at which its shadow rays start."""
 
@@ -33,12 +30,9 @@ def sun_from_seed(seed: int) -> Float[Tensor, "3 1"]:
 
 
 def sky(direction: Rays) -> Colors:
-    """Radiance of the far dome in unit directions from its centre: gradient, clouds, and haze low down."""
-    up = direction[2].clamp_min(0)
-    found = mix(HORIZON, ZENITH, smoothstep(-0.05, 0.85, up) ** 0.7)
-    at = torch.cat([direction[:2] * (1.7 / (up + 0.32)), torch.full_like(up, 3.1)[None]])
-    cover = smoothstep(0.02, 0.55, fbm(at, 1.0, 4, torch.zeros_like(up))) * smoothstep(0.02, 0.3, up)
-    return mix(mix(found, CLOUD, 0.9 * cover), HAZE, 1 - smoothstep(0.0, 0.1, direction[2]))
+    """Radiance of the far dome in unit directions from its centre: a gradient, and haze low down."""
+    found = mix(HORIZON, ZENITH, smoothstep(-0.05, 0.85, direction[2].clamp_min(0)) ** 0.7)
+    return mix(found, HAZE, 1 - smoothstep(0.0, 0.1, direction[2]))
 
 
 def tone_map(radiance: Colors) -> Colors:
@@ -55,10 +49,6 @@ class SunlitWorld(World):
 
     def __init__(self, things: Sequence[Thing], dome: float, seed: int) -> None:
         self.all, self.dome, self.sun = Thing(tuple(things)), dome, sun_from_seed(seed)
-        flat = [part for thing in things for part in (thing.parts if isinstance(thing, Thing) else ())]
-        self.shading = [
-            part for part in flat if isinstance(part, Thing) and float(part.bounds[1].max()) < LARGE
-        ]
 
     def look(self, origin: Tensor, directions: Tensor, pixel_angle: float) -> Seen:
         """As World.look; rays end on the dome at the latest."""
@@ -99,7 +89,7 @@ class SunlitWorld(World):
             slant = (normal[:, mine] * rays[:, mine]).sum(dim=0).abs()
             # Between the footprint across (1) and along (1 / cos) a slanted surface.
             albedo[:, mine] = solid.material.albedo(uv, at, footprint[mine] / slant.clamp_min(0.1).sqrt())
-        light = mix(BOUNCE, SKYLIGHT, (0.55 + 0.45 * normal[2]) * self._open(places, normal))
+        light = mix(BOUNCE, SKYLIGHT, 0.55 + 0.45 * normal[2])
         facing = (normal * self.sun).sum(dim=0)
         toward = (facing > 0).nonzero()[:, 0]
         start = places[:, toward] + LIFT * normal[:, toward]
@@ -107,18 +97,3 @@ class SunlitWorld(World):
         light[:, reached] += facing[reached] * SUN
         far = places[:2].norm(dim=0) / self.dome
         return mix(albedo * light, HAZE, smoothstep(0.35, 1.0, far))
-
-    def _open(self, places: Rays, normal: Rays) -> Float[Tensor, "n"]:
-        """How much of the sky things leave, were each the ball around it: less in corners and under roofs."""
-        left = torch.ones_like(places[0])
-        low, high = places.amin(dim=1, keepdim=True), places.amax(dim=1, keepdim=True)
-        for thing in self.shading:
-            middle, half = thing.bounds
-            size = float(half.prod()) ** (2 / 3)
-            if float((middle.clamp(low, high) - middle).square().sum()) > 25 * size:
-                continue
-            to = middle - places
-            square = to.square().sum(dim=0)
-            cosine = (to * normal).sum(dim=0) / square.clamp_min(1e-6).sqrt()
-            left *= 1 - 0.7 * cosine.clamp(0, 1) * size / square.clamp_min(size)
-        return left

@@ -4,8 +4,8 @@
 about two footprints is faded out, as a mip map would do.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -71,16 +71,15 @@ def fbm(p: Float[Tensor, "3 n"], frequency: float, octaves: int, footprint: Valu
 
 @dataclass(frozen=True)
 class Material:
-    """One finish. What the colours and the size mean is up to the kind; see its function."""
+    """One finish. What the colours and the size mean is up to the kind; see its method."""
 
-    kind: str
-    """A key of `KINDS`."""
+    kind: Literal["blocks", "clouds"]
     base: Color
     """Linear albedo."""
     second: Color
     third: Color
     size: tuple[float, float] = (1.0, 1.0)
-    """Metres: of a brick, a tile, a plank, a stripe, a cloud."""
+    """Metres: of a brick, a tile, a plank, a cloud."""
     salt: float = 0.0
     """Tells apart surfaces of the same finish."""
 
@@ -91,59 +90,35 @@ class Material:
             uv: metres along the surface.
             position: metres, in the world.
         """
-        return KINDS[self.kind](self, uv, position, footprint).clamp(0.01, 0.95)
+        at = position + self.salt
+        found = self._clouds(at, footprint) if self.kind == "clouds" else self._blocks(uv, at, footprint)
+        return found.clamp(0.01, 0.95)
+
+    def _blocks(self, uv: Float[Tensor, "2 n"], at: Float[Tensor, "3 n"], footprint: Values) -> Colors:
+        """Masonry, planks, tiles: blocks of `size` between base and third, joints of the second colour."""
+        width, height = self.size
+        row_at = uv[1] / height
+        row = row_at.floor()
+        column_at = uv[0] / width + 0.5 * (row % 2) + 0.1 * hashed(row, row, self.salt)
+        column = column_at.floor()
+        to_side = (0.5 - (column_at - column - 0.5).abs()) * width
+        to_end = (0.5 - (row_at - row - 0.5).abs()) * height
+        line = _joint(to_side.minimum(to_end), 0.03, footprint)
+        seen = (1.6 - 3.2 * footprint / width).clamp(0, 1)
+        tint, light = (hashed(column + k, row + k, self.salt) * seen for k in (0, 37))
+        wear = fbm(at, 0.8, 2, footprint)
+        found = mix(color(self.base), color(self.third), 0.5 + 0.5 * tint) * (1 + 0.1 * light + 0.2 * wear)
+        return mix(found, color(self.second), 0.6 * line)
+
+    def _clouds(self, at: Float[Tensor, "3 n"], footprint: Values) -> Colors:
+        """Stone, leaves, grass: base and third in clouds of `size`, the second in the darkest places."""
+        scale = self.size[0]
+        cloud = fbm(at / scale, 1.0, 3, footprint / scale)
+        found = mix(color(self.base), color(self.third), smoothstep(-0.6, 0.6, cloud)) * (1 + 0.25 * cloud)
+        return mix(found, color(self.second), 0.6 * smoothstep(0.2, 0.7, -cloud))
 
 
 def _joint(distance: Values, width: float, footprint: Values) -> Values:
     """How much of a footprint is covered by a line of `width`, at `distance` from its middle (box filter)."""
     cover = ((0.5 * (width + footprint) - distance) / footprint.clamp_min(1e-4)).clamp(0, 1)
     return cover.minimum(width / footprint.clamp_min(width))
-
-
-def blocks(m: Material, uv: Tensor, position: Tensor, footprint: Values) -> Colors:
-    """Masonry, planks, tiles: blocks of `size` between base and third, with joints of the second colour."""
-    width, height = m.size
-    row_at = uv[1] / height
-    row = row_at.floor()
-    column_at = uv[0] / width + 0.5 * (row % 2) + 0.1 * hashed(row, row, m.salt)
-    column = column_at.floor()
-    to_side = (0.5 - (column_at - column - 0.5).abs()) * width
-    to_end = (0.5 - (row_at - row - 0.5).abs()) * height
-    line = _joint(to_side.minimum(to_end), 0.03, footprint)
-    seen = (1.6 - 3.2 * footprint / width).clamp(0, 1)
-    tint, light = hashed(column, row, m.salt) * seen, hashed(column + 91, row + 37, m.salt) * seen
-    wear = fbm(position + m.salt, 0.8, 2, footprint)
-    found = mix(color(m.base), color(m.third), 0.5 + 0.5 * tint) * (1 + 0.1 * light + 0.2 * wear)
-    return mix(found, color(m.second), 0.6 * line)
-
-
-def paving(m: Material, uv: Tensor, position: Tensor, footprint: Values) -> Colors:
-    """Flagstones with grass growing over them in patches of the colour of meadows."""
-    at = position + m.salt
-    grown = smoothstep(0.10, 0.26, fbm(at, 0.28, 2, footprint) + 0.2 * fbm(at, 2.4, 2, footprint))
-    return mix(blocks(m, uv, position, footprint), meadow(m, uv, position, footprint), grown)
-
-
-def meadow(m: Material, uv: Tensor, position: Tensor, footprint: Values) -> Colors:  # noqa: ARG001 - as others
-    """Grass: dry and lush in patches, with tufts."""
-    lush = smoothstep(-0.5, 0.5, fbm(position + 31, 0.35, 3, footprint))
-    green = mix(color((0.24, 0.27, 0.08)), color((0.10, 0.22, 0.045)), lush)
-    return green * (1 + 0.3 * fbm(position, 1.8, 3, footprint))
-
-
-def clouds(m: Material, uv: Tensor, position: Tensor, footprint: Values) -> Colors:  # noqa: ARG001 - as others
-    """Stone, leaves, water, paint: base and third in clouds of `size`, the second in the darkest places."""
-    scale = m.size[0]
-    cloud = fbm((position + m.salt) / scale, 1.0, 3, footprint / scale)
-    found = mix(color(m.base), color(m.third), smoothstep(-0.6, 0.6, cloud)) * (1 + 0.25 * cloud)
-    return mix(found, color(m.second), 0.6 * smoothstep(0.2, 0.7, -cloud))
-
-
-def cloth(m: Material, uv: Tensor, position: Tensor, footprint: Values) -> Colors:  # noqa: ARG001 - as others
-    """A banner: stripes of base and second."""
-    return mix(color(m.base), color(m.second), (uv[0] / m.size[0]).floor() % 2)
-
-
-KINDS: dict[str, Callable[[Material, Tensor, Tensor, Values], Colors]] = {
-    f.__name__: f for f in (blocks, paving, meadow, clouds, cloth)
-}

@@ -5,8 +5,6 @@ import pytest
 from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
 
-FAST = {"A5", "A7"}
-"""The others train for long. What they rest on is in engine/train/test_health too."""
 BEHIND = {"A19": "on so small a budget several blocks are 1 to 3 dB behind one"}
 """Where ABCD does not do what it should."""
 MACHINE_DECIDES = {"A16"}
@@ -14,9 +12,9 @@ MACHINE_DECIDES = {"A16"}
 
 
 def marks(id: str) -> list:
-    """How a scenario's test is marked."""
-    found = [] if id in FAST else [pytest.mark.slow]
-    return found + ([pytest.mark.xfail(reason=BEHIND[id], strict=True)] if id in BEHIND else [])
+    """How a scenario's test is marked: all train for long."""
+    behind = [pytest.mark.xfail(reason=BEHIND[id], strict=True)] if id in BEHIND else []
+    return [pytest.mark.slow, *behind]
 
 
 @pytest.mark.parametrize(
