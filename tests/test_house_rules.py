@@ -5,7 +5,6 @@ Every rule is a function from source text to complaints, so that each is first s
 
 import ast
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -196,78 +195,6 @@ def test_the_house_is_clean(rule, paths):
 )
 def test_each_rule_notices_an_offence(rule, offence):
     assert len(list(rule(offence))) == 1
-
-
-def lint_imports(folder: Path) -> subprocess.CompletedProcess:
-    """Run import-linter with this project's contracts on the package in `folder`."""
-    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()"]
-    options = ["--no-cache", "--config", str(ROOT / ".importlinter")]
-    return subprocess.run([*command, *options], cwd=folder, capture_output=True, text=True, check=False)
-
-
-def test_imports_keep_to_the_contracts():
-    result = lint_imports(ROOT)
-    assert result.returncode == 0, result.stdout + result.stderr
-
-
-OFFENCES = [
-    ("engine/types.py", "abcd_ns.nerfstudio.model"),
-    ("engine/types.py", "abcd_ns.cli.main"),
-    ("nerfstudio/model.py", "abcd_ns.cli.main"),
-    ("engine/render/base.py", "abcd_ns.engine.train"),
-    ("engine/types.py", "nerfstudio.utils"),
-    ("engine/types.py", "viser"),
-    ("engine/types.py", "rich.console"),
-    ("engine/types.py", "tyro"),
-    ("peers/exact.py", "viser"),
-    ("run/begin.py", "abcd_ns.nerfstudio.model"),
-    ("engine/types.py", "gsplat"),
-    ("nerfstudio/model.py", "gsplat.strategy"),
-    ("cluster/dispatcher.py", "ray"),
-    ("engine/types.py", "abcd_ns.engine.space.tree"),
-]
-"""A module, and what it must not import, be it late; the last one is a cycle."""
-
-
-def told(module: str, imported: str) -> str:
-    """As import-linter names an import: packages of others by their first name."""
-    if (module, imported) == OFFENCES[-1]:
-        return ".types -> .space (1 import)"
-    name = imported if imported.startswith("abcd_ns") else imported.partition(".")[0]
-    return f"abcd_ns.{module.removesuffix('.py').replace('/', '.')} -> {name}"
-
-
-def test_the_contracts_notice_every_offence(tmp_path):
-    empty = ("errors", "progress_bar", "machine", "units", "lab/__init__", "data/__init__", "formats/ply")
-    empty += (
-        "run/begin",
-        "engine/types",
-        "engine/transfer",
-        "engine/events",
-        "engine/render/base",
-        "peers/exact",
-    )
-    floors = ("kernels", "gaussians", "render", "space", "store", "layers", "train")
-    skeleton = {f"{name}.py": "" for name in (*empty, *(f"engine/{floor}/__init__" for floor in floors))}
-    skeleton |= {"cli/main.py": "import abcd_ns.nerfstudio.model", "cluster/dispatcher.py": ""}
-    skeleton |= {"cluster/connect.py": "import ray", "cluster/ray_workers.py": "import ray"}
-    skeleton |= {"engine/space/tree.py": "import abcd_ns.engine.types", "nerfstudio/model.py": ""}
-    gsplat = ("engine/train/density/control.py", "engine/render/cuda/backend.py")
-    skeleton |= dict.fromkeys(gsplat, "import gsplat")
-    for number, (module, imported) in enumerate(OFFENCES):
-        skeleton[module] += f"\ndef late_{number}():\n    import {imported}"
-    for name, source in skeleton.items():
-        path = tmp_path / "abcd_ns" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(source)
-    for folder in [tmp_path / "abcd_ns", *(p for p in (tmp_path / "abcd_ns").rglob("*") if p.is_dir())]:
-        (folder / "__init__.py").touch()
-
-    result = lint_imports(tmp_path)
-
-    assert result.returncode == 1, result.stdout + result.stderr
-    assert "Contracts: 0 kept" in result.stdout
-    assert [edge for edge in map(told, *zip(*OFFENCES, strict=True)) if edge not in result.stdout] == []
 
 
 def entry_points() -> list[str]:

@@ -168,7 +168,7 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
         assert bool((run.scene.tree.assign(means) == block).all())
 
 
-@pytest.mark.parametrize("goes_on_with", [None, 1, 3])
+@pytest.mark.parametrize("goes_on_with", [None, 3])
 def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_on_with):
     """Also alone: what was out is planned again."""
     stopped = make(workers=2, lag=4, density=STILL)

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import shutil
 import struct
 import zlib
@@ -18,8 +17,6 @@ from abcd_ns.data.colmap_model import Z_UP, read_colmap
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
 
-REAL = Path(os.environ.get("ABCD_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
-"""Where the real scenes are, if they are."""
 SIZES = ((61, 41), (47, 33))
 """Of the two cameras; odd, so that halving rounds down."""
 NAMES = [f"{'left' if i % 2 else 'right'}/{i // 2:04d}.png" for i in range(10)]

@@ -19,7 +19,6 @@ from abcd_ns.data.input_errors import SHOWN, InputError, Problems
 from abcd_ns.data.picture_files import read_header
 from tests.data.dataparser_scenes import (
     NAMES,
-    REAL,
     SIZES,
     png_that_claims,
     refusal,
@@ -203,14 +202,6 @@ def test_photos_of_aerial_cameras_are_not_too_large(tmp_path):
     assert read_header(tmp_path / "photo.png").size == (14_204, 10_652)
 
 
-def test_all_bad_photos_are_listed_at_once(scene):
-    bad = [scene / "images" / name for name in NAMES[:3]]
-    for path in bad:
-        path.write_bytes(b"")
-    said = refusal(scene).splitlines()
-    assert sorted(said) == sorted(f"{path} is empty; copy the photo again." for path in bad)
-
-
 def test_long_lists_are_cut_with_a_count():
     problems = Problems()
     for i in range(SHOWN + 2):
@@ -296,12 +287,3 @@ def test_file_that_is_no_json_is_refused(scene, text):
     write_transforms(scene)
     (scene / "transforms.json").write_text(text)
     assert "not valid JSON" in refusal(scene)
-
-
-# Real scenes
-
-
-def test_real_scene_without_photos_is_refused():
-    if not (REAL / "garden_geometry").is_dir():
-        pytest.skip(f"{REAL / 'garden_geometry'} is not there; set ABCD_DATA to a folder that holds it")
-    assert "put the 185 photos" in refusal(REAL / "garden_geometry")

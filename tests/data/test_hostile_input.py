@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.scene import Lens
-from abcd_ns.data.undistort import undistortion
 from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -46,14 +43,6 @@ def test_odd_names_are_read_and_shown_in_one_line(tmp_path):
 
 
 # COLMAP
-
-
-def test_all_broken_files_of_a_model_are_listed_at_once(scene):
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        (scene / "sparse/0" / name).write_bytes(b"")
-    assert refusal(scene).splitlines() == [
-        f"{scene}/sparse/0/{name} is empty; copy the file again." for name in ("cameras.bin", "images.bin")
-    ]
 
 
 def test_names_given_twice_and_missing_photos_are_listed_at_once(tmp_path):
@@ -136,13 +125,6 @@ def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
     assert decoded == []
 
 
-def test_a_deep_mask_is_a_mask(scene):
-    mask = write_masks(scene)[0]
-    Image.fromarray(np.full(Image.open(mask).size[::-1], 40_000, np.uint16)).save(mask)
-    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
-    assert bool(AbcdDataset(outputs).photos.mask(0).all())
-
-
 def test_masks_are_no_photos_without_pose(scene, capsys):
     meta = write_transforms(scene)
     for frame in meta["frames"]:
@@ -213,13 +195,6 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
 def test_lists_that_leave_one_side_empty_are_refused(scene, kept, message):
     (scene / "test_list.txt").write_text("\n".join(NAMES[:kept]))
     assert message in refusal(scene)
-
-
-@pytest.mark.parametrize("coefficients", [(-3.0,), (-1.2, 0.1), (1e6,), (0.0, 0.0, 5.0, 5.0)])
-def test_absurd_distortion_is_refused(coefficients):
-    padded = coefficients + (0.0,) * (8 - len(coefficients))
-    with pytest.raises(InputError, match="leaves no picture"):
-        undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
 
 
 def test_palette_becomes_its_colors(tmp_path):

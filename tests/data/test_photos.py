@@ -106,14 +106,6 @@ def test_budget_bounds_memory_and_changes_no_pixel(sources, budget):
     assert (photos.cached_bytes > 0) == (budget != 0)
 
 
-def test_least_recently_used_photo_goes_first(sources, monkeypatch):
-    reads = _count_reads(monkeypatch)
-    photos = Photos(sources, 2 * WIDTH * HEIGHT * 3)
-    for i in (0, 1, 0, 2, 0, 1):
-        photos.image(i)
-    assert reads == [0, 1, 2, 1]
-
-
 def test_threads_agree_on_photos(sources):
     photos, start = Photos(sources), Barrier(4)
 
@@ -137,15 +129,6 @@ def test_expected_photo_is_read_once_and_before_it_is_asked_for(sources, monkeyp
     assert sorted(reads) == [1, 2]
     photos.image(1)  # expected once, and no budget to keep it
     assert sorted(reads) == [1, 1, 2]
-
-
-def test_kept_photo_is_not_read_again_because_it_is_expected(sources, monkeypatch):
-    reads = _count_reads(monkeypatch)
-    photos = Photos(sources)
-    photos.image(0)
-    photos.expect([0])
-    photos.image(0)
-    assert reads == [0]
 
 
 def test_expected_photo_that_is_gone_is_told_to_who_asks(sources):
@@ -208,17 +191,6 @@ def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp
     error = cut[..., :3] * cut[..., 3:] / 255 - black
     assert np.abs(error).max() < (2 if lens is None else 3)  # OpenCV rounds weights of 8-bit pixels to 1/32
     assert 0.2 < (cut[..., 3] > 0).mean() <= 1
-
-
-def test_an_opaque_photo_is_resampled_alike_with_alpha_and_without(tmp_path):
-    opaque = np.concatenate([noise(0), np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2)
-    rgb, rgba = (
-        Photos(
-            [PhotoSource(saved(tmp_path / f"{k}.png", i), (WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2))]
-        ).image(0)
-        for k, i in enumerate((noise(0), opaque))
-    )
-    assert np.array_equal(rgba[..., :3], rgb)
 
 
 # Masks

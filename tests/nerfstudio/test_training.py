@@ -23,7 +23,6 @@ from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
-from abcd_ns.run.fit import RamShares
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
 
 STEPS = 36
@@ -89,11 +88,6 @@ def run(
 @pytest.fixture(scope="module")
 def trained(data, tmp_path_factory) -> AbcdTrainer:
     return run(configure(data, tmp_path_factory.mktemp("out")))
-
-
-def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
-    assert trained.pipeline.datamanager.device_photo_bytes == 0
-    assert trained.pipeline.coordinator.layer_limit == RamShares.of(0).layers
 
 
 @pytest.mark.parametrize("end", [RuntimeError, Stopped])

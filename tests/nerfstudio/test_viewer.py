@@ -179,10 +179,6 @@ def test_boxes_are_there_while_it_trains_and_afterwards_when_wanted(watched):
     watched.browser.wait_for(shows(True), since)
 
 
-def test_the_step_moves_to_the_last_one(watched):
-    assert any(text.startswith(f"Step: {STEPS}") for text in texts(watched))
-
-
 def test_the_user_sees_the_photo_that_is_taken_nearest(watched):
     since = watched.browser.heard
     watched.choose("Nearest photo", True)

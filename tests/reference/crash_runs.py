@@ -153,18 +153,10 @@ class Runs:
 
     body: Callable[..., None] = staticmethod(run)
     """What a process does."""
-    modules: tuple[str, ...] = ("tests.reference.crash_runs",)
-    """What the server imports, besides what torch would import late, and slowly, in every process."""
-
-    def __init__(self) -> None:
-        # Before the server starts: libraries read it when they are imported.
-        os.environ["OMP_NUM_THREADS"] = "1"
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["torch._dynamo", *self.modules])
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
-        """A process; see `body` for its arguments."""
-        process = self._context.Process(target=self.body, args=args, kwargs=options)
+        """A process, forked: to import torch and nerfstudio in each would take seconds."""
+        process = multiprocessing.get_context("fork").Process(target=self.body, args=args, kwargs=options)
         process.start()
         return process
 

@@ -1,14 +1,10 @@
 """Where layers lie on a device: there, in RAM, or nowhere; and what is copied for it."""
 
-from collections import Counter
-
 import pytest
 import torch
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.train import layer_source, memory
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, equal, whole_scene
 from tests.reference.simulated_device import DEVICE
@@ -76,23 +72,3 @@ def test_a_run_does_not_depend_on_where_its_layers_are(on_device, photos):
         assert max(held) <= coordinator.layer_limit == on + ram
         scenes.append(whole_scene(coordinator))
     assert all(equal(scenes[0], other) for other in scenes[1:])
-
-
-@pytest.mark.parametrize(("floats", "groups"), [(1, 4), (1e6, 1)])
-def test_where_steps_take_much_memory_layers_are_drawn_for_more_views_at_once(
-    on_device, photos, monkeypatch, floats, groups
-):
-    """Each time that blocks around the one that is visited are read, some are copied to the device anew."""
-    for module in (memory, layer_source):
-        monkeypatch.setattr(module, "PARTS_BYTES", 1)
-    monkeypatch.setattr(memory, "PIXEL_FLOATS", floats)
-    coordinator = on_device(blocks=4, density=STILL, warmup=0.0, pass_gaussians=1, steps=1)
-    loaded, load = Counter(), LayerRenderer.load
-
-    def counted(self, node, **options):
-        loaded[node] += 1
-        return load(self, node, **options)
-
-    monkeypatch.setattr(LayerRenderer, "load", counted)
-    train(coordinator, photos, steps=1)
-    assert set(loaded.values()) == {groups}

@@ -100,19 +100,6 @@ def test_a_checkpoint_is_evaluated_and_composited(trained):
     assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
 
 
-def test_a_run_is_gone_on_with(data, tmp_path, trained):
-    longer = run(on_device(data, tmp_path, load_dir=trained.checkpoint_dir, steps=STEPS + 3))
-    assert longer.pipeline.coordinator.state.step == STEPS + 3
-
-
-@pytest.mark.parametrize(
-    "method", [methods.abcd_partition, methods.abcd_exact], ids=lambda method: method.config.method_name
-)
-def test_the_other_methods_train(data, tmp_path, method):
-    trainer = run(on_device(data, tmp_path, method, steps=4))
-    assert trainer.pipeline.coordinator.state.step == 4
-
-
 def test_photos_are_copied_once_while_there_is_room_and_else_as_bytes(trained, counts, monkeypatch):
     manager = trained.pipeline.datamanager
     crop, rows = Crop(3, 2, 10, 8), range(len(manager.train_dataset))

@@ -63,14 +63,6 @@ def test_the_device_holds_one_node_at_a_time(drawn):
     assert max(drawn) < len(GAUSSIANS) / 4
 
 
-def test_what_cannot_be_seen_is_not_drawn(drawn):
-    opaque = torch.full_like(GAUSSIANS.opacities, 9.0)
-    wall = replace(GAUSSIANS, opacities=opaque, scales=GAUSSIANS.scales + 3)
-    found = pictures("means", scene=MemoryScene(TREE, wall)).everything()
-    assert len(drawn) < 6
-    assert float(found.transmittance.max()) < 1e-3
-
-
 def test_a_block_alone_is_its_own_gaussians():
     owner = TREE.assign(GAUSSIANS.means)
     found = pictures().draw(Show.BLOCK, 2)

@@ -70,8 +70,3 @@ def test_a_line_that_is_none_is_named(tmp_path, bad, message):
     with pytest.raises(RecordError, match=message) as refused:
         read_story(path)
     assert str(path) in str(refused.value)
-
-
-def test_a_missing_log_is_named(tmp_path):
-    with pytest.raises(RecordError, match=r"absent\.jsonl does not exist"):
-        read_story(tmp_path / "absent.jsonl")

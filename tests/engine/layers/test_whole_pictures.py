@@ -1,6 +1,5 @@
 """Whole pictures, drawn node by node, and their gradient by the pose."""
 
-import weakref
 from dataclasses import replace
 
 import pytest
@@ -59,22 +58,6 @@ def test_pictures_and_gradients_of_poses_are_those_of_the_merged_picture(pass_ga
         expected = torch.tensor([(loss(view, step) - loss(view, -step)) / 2e-6 for step in steps])
         assert torch.allclose(by_step(matrix, view.viewmat).float(), expected, rtol=2e-3, atol=2e-2)
         assert float(expected.abs().min()) > 0.1
-
-
-def test_a_graph_goes_before_the_next_view_is_drawn():
-    """However many views are asked for at once, no more than one has its graph."""
-    pictures, alive = whole_pictures_of(1000), []
-    inner = pictures._raster
-
-    def raster(*arguments):
-        assert not any(reference() is not None for reference in alive)
-        drawn = inner(*arguments)
-        alive.append(weakref.ref(drawn.color))
-        return drawn
-
-    pictures._raster = raster
-    pictures.differentiate(VIEWS, lambda view, _: weights_for(view))
-    assert len(alive) == len(VIEWS)
 
 
 def test_views_are_drawn_together_as_far_as_their_layers_have_room():

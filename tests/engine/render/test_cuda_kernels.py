@@ -178,22 +178,6 @@ def test_what_has_run_compiles():
         fused(ON_CUDA, ON_CUDA)
 
 
-def test_they_run_on_the_device_that_has_the_tensors(monkeypatch):
-    seen = []
-
-    class Guard:
-        def __init__(self, of):
-            seen.append(of)
-
-        def __enter__(self): ...
-
-        def __exit__(self, *_): ...
-
-    monkeypatch.setattr(torch.cuda, "device_of", Guard)
-    Fused("The loss", lambda *_: 0)(ON_CUDA)
-    assert seen == [ON_CUDA]
-
-
 def test_they_are_for_single_floats_on_cuda():
     fused = Fused("The loss", lambda rendered, photo, *_: (rendered, photo))
     assert fused(ON_CUDA, ON_CUDA, 0.5, 0.25) is not None

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.render import TorchRasterizer, self_check
-from abcd_ns.engine.render.self_check import CASES, TOLERANCE, check_scene, errors, values_and_gradients
+from abcd_ns.engine.render.self_check import CASES, TOLERANCE, errors, values_and_gradients
 from abcd_ns.engine.types import Crop, Gaussians
 
 
@@ -98,15 +98,6 @@ def test_a_fault_is_refused(fault, what, case):
         RuntimeError, match=rf'"broken" on cpu is off in {what} of {case} by .* Set the rasterizer to "torch"'
     ):
         self_check(Broken(fault), "cpu")
-
-
-def test_the_scene_would_show_faults():
-    gaussians, view = check_scene("cpu")
-    raster = TorchRasterizer(use_native=False)(gaussians, view, sh_degree=3)
-    assert int((raster.info["radii"] > 0).sum()) > 20
-    assert raster.transmittance.min() < 0.2
-    assert raster.transmittance.max() > 0.9
-    assert all(value.dtype == torch.float32 for _, value in gaussians.items())
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -38,7 +38,6 @@ def test_a_run_killed_at_any_time_ends_as_it_would_have(runs, undisturbed, tmp_p
     ("point", "nth", "commit_seconds"),
     [
         (crash_points.SHARDS_IN_PLACE, 4, 0.0),
-        (crash_points.GENERATION_PUBLISHED, 6, 0.0),
         (crash_points.VISIT_TRAINED, 2, 0.0),
         # While it writes beside the training.
         (crash_points.FILE_WRITTEN, 9, 0.02),

@@ -63,24 +63,6 @@ def hold_up(scene: StoredScene, disk: Disk, step: int, block: int) -> None:
     assert disk.asked.wait(PATIENCE)
 
 
-class Guarded(dict):
-    """To go through it takes the lock: the writer takes things out."""
-
-    def __init__(self, scene: StoredScene) -> None:
-        super().__init__(scene._unsaved)
-        self._lock = scene._writer.lock
-
-    def values(self):
-        assert self._lock._is_owned()
-        return super().values()
-
-
-def test_what_is_not_on_disk_yet_is_counted_under_the_lock(scene):
-    scene._unsaved = Guarded(scene)
-    rest(scene, 1, 0)
-    assert scene.cached_bytes > 0
-
-
 @pytest.mark.parametrize(
     "which", [None, lambda means, scales: ((means + scales)[:, 0] * 1000).long() % 2 == 0]
 )
@@ -314,14 +296,6 @@ def test_a_block_is_read_ahead(scene, reads):
     scene.read_ahead(2)
     scene.flush()
     assert len(reads) == 1
-
-
-def test_no_shard_is_read_twice_where_ram_suffices(make, photos, reads):
-    coordinator = make(blocks=3, steps=60, commit_seconds=0.0)
-    reads.clear()
-    train(coordinator, photos)
-    assert coordinator.state.sweep > 0
-    assert len(reads) == 2 * 3  # their Gaussians for the plan of the epoch; the rest for the first visit
 
 
 # The pending migrants

@@ -113,13 +113,6 @@ def test_without_room_nothing_is_added_but_the_transparent_go():
     assert torch.equal(params["means"], gaussians.means[3:])
 
 
-def test_after_the_last_refinement_nothing_changes():
-    params, optimizers = live(random_gaussians(8))
-    control = DensityControl(DensityConfig())
-    control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock(progress=0.6))
-    assert len(params["means"]) == 8
-
-
 def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit(monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.train.density.control.MCMC_NOISE_LR", 0.0)
     gaussians = random_gaussians(100)
@@ -209,27 +202,3 @@ def test_refining_needs_something_to_judge_by():
     assert not control.refines(due, {})
     assert not control.refines(clock(refined=98), statistics(1.0))
     assert DensityControl(DensityConfig("mcmc")).refines(due, {})
-
-
-def test_random_numbers_are_forked_only_where_any_are_drawn(monkeypatch):
-    """It takes a wait on a device."""
-    forks, fork = [], torch.random.fork_rng
-    monkeypatch.setattr(torch.random, "fork_rng", lambda **options: forks.append(1) or fork(**options))
-    params, optimizers = live(random_gaussians(8))
-    control = DensityControl(DensityConfig())
-    growth = control.after_step(params, optimizers, statistics(*[1.0] * 8), (), (), clock(steps=7, refined=7))
-    assert forks == []
-    control.after_step(params, optimizers, growth, (), (), clock())
-    assert forks == [1]
-
-
-def test_a_refinement_leaves_the_allocator_its_memory(monkeypatch):
-    emptied = []
-    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(1))
-    lent = torch.cuda.empty_cache
-    params, optimizers = live(random_gaussians(8, size=0.001))
-    control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
-    control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock())
-    assert len(params["means"]) == 9
-    assert emptied == []
-    assert torch.cuda.empty_cache is lent

@@ -79,13 +79,6 @@ def test_the_others_and_their_statistics_stay_and_the_halves_inherit():
     assert growth["weight"].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_nobody_is_split_where_none_is_to_be():
-    before = random_gaussians(5)
-    after, found = after_split(before, [False] * 5, growth={"weight": torch.ones(5)})
-    assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in PARAM_NAMES)
-    assert found["weight"].tolist() == [1.0] * 5
-
-
 def test_a_picture_changes_less_than_by_copies_or_by_halves_drawn_at_random():
     """What 3DGS does to small ones, and to large ones."""
     draw, views = TorchRasterizer(), ring_of_views(3, width=80, height=60)
@@ -109,10 +102,6 @@ def test_a_picture_changes_less_than_by_copies_or_by_halves_drawn_at_random():
 def test_those_grow_that_want_to_most(room, expected):
     wanted = torch.tensor([0.0, 1.0, 3.0, 2.0, torch.inf, 0.0])
     assert chosen(wanted, room).nonzero().flatten().tolist() == expected
-
-
-def test_where_there_is_more_room_than_gaussians_only_those_grow_that_want_to():
-    assert chosen(torch.tensor([0.0, 1.0]), 5).tolist() == [False, True]
 
 
 def test_the_opaque_stay_opaque():

@@ -147,16 +147,6 @@ def test_when_the_warm_up_is_over_nothing_of_it_stays_live(begin, photos):
     assert seen == [[0, 0, 0]] * 6
 
 
-def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(grown, monkeypatch):
-    coordinator = grown(visit_views=2)
-    asked = asked_of(coordinator, monkeypatch)
-    for number in range(4):
-        active = coordinator.visits.begin()
-        assert asked[number:] == [list(active.views)]
-        assert sorted(active.geometry.crops) == sorted(active.views)
-        assert len(active.views) <= 3 < len(active.trained_on)
-
-
 def test_views_that_show_a_block_no_more_are_found_out(grown, monkeypatch):
     coordinator, blind = grown(visit_views=2), (0, 1, 2)
     asked_of(coordinator, monkeypatch, blind)

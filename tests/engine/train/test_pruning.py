@@ -102,10 +102,6 @@ def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(
     assert risen(3.0, progress, ends) == pytest.approx(expected)
 
 
-def test_drawings_without_weights_say_nothing():
-    assert blend_sums([{"means2d": torch.zeros(1, 3, 2)}], 5) == {}
-
-
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, blocks):
     density = replace(STILL, price=1.0)

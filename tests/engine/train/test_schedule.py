@@ -74,11 +74,6 @@ def test_the_steps_of_an_under_trained_block_draw_fewer_views(trained, draws):
     assert views_per_step(0, 1, trained=trained) == 1
 
 
-def test_the_last_epoch_is_shared_in_proportion():
-    plans = plan_epoch(3, {0: 10, 1: 30}, passes=4, remaining=80, seed=0)
-    assert {plan.block: plan.steps for plan in plans} == {0: 20, 1: 60}
-
-
 @given(count=st.integers(1, 20), steps=st.integers(0, 100), visit=st.integers(0, 9))
 def test_views_are_used_evenly(count, steps, visit):
     order = view_order(tuple(range(count)), steps, visit, seed=1)
