@@ -34,7 +34,7 @@ def test_it_trains_grows_and_draws_on_a_cpu():
 
     torch.manual_seed(0)
     config = scaled(method_configs["splatfacto"], 1500).pipeline.model
-    config = replace(config, num_downscales=0, cull_alpha_thresh=0.0, background_color="black")
+    config = replace(config, num_downscales=0, cull_alpha_thresh=0.005, background_color="black")
     points = 0.3 * torch.randn(200, 3), 255 * torch.rand(200, 3)
     model = Splatfacto(config, scene_box=BOX, num_train_data=1, seed_points=points)
     away = torch.eye(4)[None, :3]
