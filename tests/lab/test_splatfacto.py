@@ -54,8 +54,9 @@ def test_it_trains_grows_and_draws_on_a_cpu():
             adam.step()
         model.step_post_backward(step)
         losses.append(float(loss.detach()))
-    assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
+    assert losses[-1] < 0.7 * losses[1]
     assert model.num_points > 200
+    model.eval()
     picture = model.get_outputs_for_camera(camera)["rgb"]
     assert picture.shape == (32, 48, 3)
 

@@ -202,7 +202,7 @@ class VisitTraining:
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
-        if not active.is_all:
+        if not active.is_all and not self.live.is_new:
             self.live.judge()
         self.live.shrink_oversized()
         if not active.is_whole:

@@ -1,6 +1,5 @@
 """The warm-up: bounded, lossless, resumable."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import Clocks
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.coarse_model import BEGINS, REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.store.special_blocks import DEFERRED, in_order
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -50,8 +49,7 @@ def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, ph
     coordinator = make(blocks=4, steps=40, coarse_model=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
-    begins = math.ceil(BEGINS * 30)
-    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == begins
+    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
     batch = coordinator.next_batch()
     assert [sample.crop for sample in batch.samples] == [views[0].full]
     assert all(sample.layers is None for sample in batch.samples)
@@ -83,7 +81,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
     coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.25, density=STILL, heal=False)
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
-    assert len(whole_scene(coordinator)) == math.ceil(BEGINS * 30)
+    assert len(whole_scene(coordinator)) == 30
     for name, value in whole_scene(coordinator).items():
         assert torch.equal(getattr(scene.everything("cpu"), name), value), name
     while len(visited) < 4:
@@ -168,3 +166,15 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
         train_step(coordinator, photos)
     assert coordinator.state.step == expected
     assert not coordinator.state.active
+
+
+def test_a_visit_in_which_deferred_points_join_prunes_none(make, photos):
+    density = replace(STILL, price=1e9)
+    coordinator = make(blocks=2, steps=400, coarse_model=30, warmup=0.1, density=density)
+    ended, counts = listen(coordinator, VisitEnded), {}
+    while len(ended) < 4:
+        train_step(coordinator, photos)
+        if len(ended) == len(counts) + 1:
+            counts[len(ended)] = coordinator.count()
+    assert [counts[k] for k in (1, 2, 3)] == [120] * 3  # the warm-up, and each block's first
+    assert counts[4] < 120

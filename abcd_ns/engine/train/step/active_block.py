@@ -27,6 +27,8 @@ class ActiveBlock:
         self._run = run
         self.growth: dict[str, Tensor] = {}
         self.clocks = Clocks()
+        self.is_new = False
+        """Whether deferred points joined it when its visit began: they have had no time to be of use."""
         self._held: tuple[Tensor, Tensor] | None = None
         run.optimizers["features_rest"].register_step_pre_hook(self._hold_degrees)
 
@@ -45,6 +47,7 @@ class ActiveBlock:
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(rows_for_visit(*which), run.config.sh_degree, run.device)
         rest = state_for_visit(*which).to(run.device)
+        self.is_new = not active.is_whole and bool(run.scene.state(active.geometry.block).deferred.any())
         if active.done == 0 and not run.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, run.params, run.optimizers, batch=batch)
