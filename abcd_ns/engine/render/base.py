@@ -83,17 +83,17 @@ class Rasterizer(Protocol):
     """Of primitive, backend and version, in messages."""
     primitive: Primitive
     """What a Gaussian is."""
-    window_side: int
+    tile_side: int
     """Side of the tiles that z windows are given by, px."""
 
     @property
     def slack(self) -> float:
         """How far beyond its own size a Gaussian may count on screen, px: blur, half a tile's diagonal."""
-        return self.primitive.blur_pixels + self.window_side / math.sqrt(2)
+        return self.primitive.blur_pixels + self.tile_side / math.sqrt(2)
 
     def window_grid(self, crop: Crop) -> TileGrid:
         """The tiles of a crop that its z windows are given by."""
-        return TileGrid(crop, self.window_side)
+        return TileGrid(crop, self.tile_side)
 
     def warm_up(self) -> None:
         """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""

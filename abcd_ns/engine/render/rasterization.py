@@ -9,6 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, Shot, TorchRasterizer, make_rasterizer
+from abcd_ns.engine.render.cpu.backend import NO_ABSGRAD
 from abcd_ns.engine.types import Gaussians, View
 
 FIXED = {
@@ -89,7 +90,7 @@ def rasterization(
     rasterizer = rasterizer_on(means.device)
     if absgrad:
         if not isinstance(rasterizer, TorchRasterizer):
-            raise ValueError("absgrad=True is not supported here on a GPU: call gsplat's own rasterization.")
+            raise ValueError(NO_ABSGRAD)
         options["absgrad"] = True
     rasters = rasterizer.draw(gaussians, shots, **options)
     color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))

@@ -33,7 +33,7 @@ class ResidualSums(Protocol):
         ...
 
 
-class SumsApart(ResidualSums):
+class SumsApart:
     """Sums that are found at once, apart from the drawing's gradients.
 
     Args:

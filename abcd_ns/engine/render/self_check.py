@@ -147,7 +147,7 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
     Raises:
         RuntimeError: a value or gradient differs by more than rounding.
     """
-    options = {"window_side": rasterizer.window_side, "primitive": rasterizer.primitive.name}
+    options = {"tile_side": rasterizer.tile_side, "primitive": rasterizer.primitive.name}
     largest, reference = 0.0, TorchRasterizer(use_native=False, **options)
     for case in CASES:
         expected = values_and_gradients(reference, "cpu", case)

@@ -69,37 +69,18 @@ class TileGrid:
             counts.append((low + self.side).clamp_max(start + size) - low.clamp_min(start))
         return (counts[1][:, None] * counts[0]).flatten()
 
-    def holding(self, grid: "TileGrid", tiles: Int[Tensor, "q"]) -> Int[Tensor, "q"]:
-        """The tiles of this grid that hold these tiles of another one, of which they are parts.
-
-        Args:
-            grid: of a crop that lies within this crop.
-        """
-        rows = (grid.first_row + torch.div(tiles, grid.cols, rounding_mode="floor")) * grid.side
-        cols = (grid.first_col + tiles % grid.cols) * grid.side
-        rows, cols = (torch.div(x, self.side, rounding_mode="floor") for x in (rows, cols))
-        return (rows - self.first_row) * self.cols + cols - self.first_col
-
-    def origins(
-        self, tiles: Int[Tensor, "a"], dtype: torch.dtype
-    ) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
-        """(x, y) of the tiles' upper left corners, in pixels of the full image."""
-        x = (self.first_col + tiles % self.cols) * self.side
-        y = (self.first_row + tiles // self.cols) * self.side
-        return x.to(dtype), y.to(dtype)
-
-    def to_tiles(self, image: Float[Tensor, "c h w"], fill: float = 0.0) -> Float[Tensor, "c p t"]:
-        """[channel, pixel in tile, tile] from an image of the crop; `fill` where tiles stick out of it."""
+    def to_tiles(self, image: Float[Tensor, "c h w"], fill: float = 0.0) -> Float[Tensor, "c t p"]:
+        """[channel, tile, pixel in tile] from an image of the crop; `fill` where tiles stick out of it."""
         left, top = self.crop.x - self.first_col * self.side, self.crop.y - self.first_row * self.side
         right = self.cols * self.side - left - self.crop.width
         bottom = self.rows * self.side - top - self.crop.height
         padded = F.pad(image, (left, right, top, bottom), value=fill)
-        tiled = padded.view(-1, self.rows, self.side, self.cols, self.side).permute(0, 2, 4, 1, 3)
-        return tiled.reshape(image.shape[0], self.pixels_per_tile, self.rows * self.cols)
+        tiled = padded.view(-1, self.rows, self.side, self.cols, self.side).transpose(2, 3)
+        return tiled.reshape(len(image), self.tiles, self.pixels_per_tile)
 
-    def to_image(self, tiled: Float[Tensor, "c p t"]) -> Float[Tensor, "c h w"]:
+    def to_image(self, tiled: Float[Tensor, "c t p"]) -> Float[Tensor, "c h w"]:
         """The inverse of `to_tiles`."""
-        blocks = tiled.reshape(-1, self.side, self.side, self.rows, self.cols).permute(0, 3, 1, 4, 2)
-        padded = blocks.reshape(tiled.shape[0], self.rows * self.side, self.cols * self.side)
+        blocks = tiled.reshape(-1, self.rows, self.cols, self.side, self.side).transpose(2, 3)
+        padded = blocks.reshape(len(tiled), self.rows * self.side, self.cols * self.side)
         top, left = self.crop.y - self.first_row * self.side, self.crop.x - self.first_col * self.side
         return padded[:, top : top + self.crop.height, left : left + self.crop.width]

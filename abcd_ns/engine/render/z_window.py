@@ -43,20 +43,19 @@ class ZWindow:
         return ZWindow(self.grid, torch.maximum(self.near, other.far), self.far)
 
     def on(self, grid: TileGrid) -> "ZWindow":
-        """The same window on the tiles of a crop of this crop, as large as these or parts of them.
+        """The same window on the tiles of a crop of this crop.
 
         Raises:
-            ValueError: the grid's tiles are no parts of these, or its crop is not within this one.
+            ValueError: the grid's tiles are none of these.
         """
         if grid == self.grid:
             return self
-        own, inner = self.grid.crop, grid.crop
-        inside = own.x <= inner.x and inner.x + inner.width <= own.x + own.width
-        inside = inside and own.y <= inner.y and inner.y + inner.height <= own.y + own.height
-        if self.grid.side % grid.side or not inside:
-            raise ValueError(f"a window on {self.grid} says nothing about {grid}")
-        tile = self.grid.holding(grid, torch.arange(grid.tiles, device=self.near.device))
-        return ZWindow(grid, self.near.index_select(0, tile), self.far.index_select(0, tile))
+        x, y, own = grid.first_col - self.grid.first_col, grid.first_row - self.grid.first_row, self.grid
+        if grid.side != own.side or min(x, y) < 0 or x + grid.cols > own.cols or y + grid.rows > own.rows:
+            raise ValueError(f"a window on {own} says nothing about {grid}")
+        rows, cols = slice(y, y + grid.rows), slice(x, x + grid.cols)
+        near, far = (ends.view(own.rows, own.cols)[rows, cols].flatten() for ends in (self.near, self.far))
+        return ZWindow(grid, near, far)
 
 
 def ends_of(window: ZWindow | None, grid: TileGrid, like: Tensor) -> Float[Tensor, "2 t"]:

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from abcd_ns.engine.kernels import library
 from abcd_ns.engine.render import TorchRasterizer, self_check
 from abcd_ns.engine.render.self_check import CASES, TOLERANCE, errors, values_and_gradients
 from abcd_ns.engine.types import Crop, Gaussians
@@ -70,8 +71,10 @@ class Broken(TorchRasterizer):
 
 def test_a_sound_backend_passes():
     assert self_check(TorchRasterizer(use_native=False), "cpu") == 0.0
-    # Other tiles add up in another order: close, and not the very same computation.
-    assert 0 < self_check(TorchRasterizer(use_native=False, tile_side=8), "cpu") < 1e-4
+    # The reference takes the backend's tiles, so that with any it is the very same computation.
+    assert self_check(TorchRasterizer(use_native=False, tile_side=8), "cpu") == 0.0
+    if library() is not None:  # close, and not the very same
+        assert 0 < self_check(TorchRasterizer(), "cpu") < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -102,10 +105,10 @@ def test_a_fault_is_refused(fault, what, case):
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 @pytest.mark.parametrize("shift", [-3e-5, 3e-5])
-@pytest.mark.parametrize("window_side", [4, 16])
-def test_no_case_hangs_on_rounding(case, shift, window_side):
+@pytest.mark.parametrize("tile_side", [4, 16])
+def test_no_case_hangs_on_rounding(case, shift, tile_side):
     """No fragment is so near to a threshold of drawing that other kernels' rounding would change sides."""
-    draw = TorchRasterizer(use_native=False, window_side=window_side)
+    draw = TorchRasterizer(use_native=False, tile_side=tile_side)
     found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
     assert max(errors(found, expected).values()) < TOLERANCE / 4
 

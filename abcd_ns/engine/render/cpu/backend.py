@@ -1,11 +1,10 @@
 """The torch rasterizer: gsplat's drawing for any device, by the native library on a CPU."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.kernels import library
@@ -14,15 +13,17 @@ from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu import native, reference
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, camera_numbers, check_degree, project_in_torch
-from abcd_ns.engine.render.residual_sums import ResidualSums, SumsApart
 from abcd_ns.engine.render.splat_kernels import DEPTH
-from abcd_ns.engine.render.together import runs
-from abcd_ns.engine.render.z_window import ZWindow, showing, window_between
+from abcd_ns.engine.render.together import Item, runs
+from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 PIXELS_AT_ONCE, SPLATS_AT_ONCE = 1 << 17, 200_000
 """Of the views that layers are drawn for in one pass, at most: for a few pixels or Gaussians calls cost more
 than what they compute."""
+
+
+NO_ABSGRAD = "absgrad=True is not supported here: it takes float32 on a CPU and a C++ compiler."
 
 
 class TorchRasterizer(Rasterizer):
@@ -34,29 +35,20 @@ class TorchRasterizer(Rasterizer):
     Args:
         use_native: False draws everything in torch.
         tile_side: pixels along a tile's side; a divisor of 16. The native library has 4.
-        window_side: pixels along the sides of the tiles of its z windows; 0 takes `tile_side`.
         primitive: what a Gaussian is.
 
     Raises:
-        ValueError: `tile_side` does not divide 16, or `window_side` is no multiple of it.
+        ValueError: `tile_side` does not divide 16.
     """
 
     def __init__(
-        self,
-        *,
-        use_native: bool = True,
-        tile_side: int = native.SIDE,
-        window_side: int = 0,
-        primitive: PrimitiveName = "3dgs",
+        self, *, use_native: bool = True, tile_side: int = native.SIDE, primitive: PrimitiveName = "3dgs"
     ) -> None:
         if tile_side < 1 or 16 % tile_side:
             raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
-        if window_side % tile_side:
-            raise ValueError(f"window_side is {window_side}; choose a multiple of tile_side, {tile_side}.")
         self.primitive = PRIMITIVES[primitive]
         self.name = f"{self.primitive.prefix}torch-4"
         self.tile_side = tile_side
-        self.window_side = window_side or tile_side
         self._use_native = use_native and tile_side == native.SIDE
 
     def warm_up(self) -> None:
@@ -64,26 +56,12 @@ class TorchRasterizer(Rasterizer):
         if self._use_native and library() is not None:
             torch.set_num_threads(1)
 
-    def _suits(self, gaussians: Gaussians, *others: Tensor) -> bool:
-        known = gaussians.features_rest.shape[1] in native.COEFFICIENTS
-        return self._use_native and known and suits(gaussians.means, *others)
-
     @torch.no_grad()
     def project(
         self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
     ) -> Splats:
         """See Rasterizer.project."""
         return Splats(self._project(gaussians, [view], sh_degree, antialiased)[0])
-
-    def _project(
-        self, gaussians: Gaussians, views: Sequence[View], sh_degree: int, antialiased: bool
-    ) -> Float[Tensor, "v r n"]:
-        check_degree(gaussians, sh_degree)
-        cameras = [camera_numbers(view, gaussians.means, sh_degree, antialiased) for view in views]
-        learns_poses = torch.is_grad_enabled() and any(camera.requires_grad for camera in cameras)
-        if learns_poses or not self._suits(gaussians):
-            return project_in_torch(gaussians, cameras, self.primitive)
-        return native.project(gaussians, torch.stack(cameras).detach(), self.primitive)
 
     def draw(
         self,
@@ -107,82 +85,34 @@ class TorchRasterizer(Rasterizer):
         takes = planes.requires_grad
         means2d = planes.detach()[:, center].transpose(1, 2).contiguous().requires_grad_(takes)
         weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_() if blend_weights else None
-        info = _info(means2d, planes, shots) | ({"weights": weights} if blend_weights else {})
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
+        parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
+        parts += [native.Part(others, k, True) for k, others in frozen]
         crops, windows = [shot.crop for shot in shots], [shot.z_window for shot in shots]
-        if self._suits(gaussians, planes, *(others for _, others in frozen)):
-            parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
-            parts += [native.Part(others, k, True) for k, others in frozen]
-            lists = native.Lists(parts, crops, self.primitive, windows, wants_weights=blend_weights)
-            drawing = native.Drawing(lists, means2d=means2d if absgrad else None)
-            info |= {"sums": drawing} if judge else {}
-            drawn = iter(native.Composite.apply(planes, means2d, weights, drawing))
-            return tuple(
-                Raster(color, left, depth, info) for color, left, depth in zip(*[drawn] * 3, strict=True)
-            )
+        lists = self._lists(gaussians, parts, crops, windows, blend_weights)
         if absgrad:
-            raise ValueError("absgrad takes the native kernel: float32 on a CPU, and a compiler")
-        images, sums = self._composited_in_torch(planes, shots, means2d, weights)
+            if not isinstance(lists, native.Lists):
+                raise ValueError(NO_ABSGRAD)
+            lists.absolute = means2d
+        pictures, sums = lists.composite(planes, means2d, weights)
+        info = _info(means2d, planes, shots) | ({"weights": weights} if blend_weights else {})
         info |= {"sums": sums} if judge else {}
-        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
-
-    def _composited_in_torch(
-        self,
-        planes: Float[Tensor, "v r n"],
-        shots: Sequence[Shot],
-        means2d: Float[Tensor, "v n 2"],
-        weights: Float[Tensor, "v n"] | None,
-    ) -> tuple[list[Float[Tensor, "5 h w"]], ResidualSums]:
-        """By reference.composite; see native.Composite for `means2d` and `weights`."""
-        center = self.primitive.center
-        frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
-        windows = [shot.z_window for shot in shots]
-        # The leaves add nothing, and get the gradients.
-        own = list(planes[:, : self.primitive.graded].unbind(1))
-        for axis in range(2):
-            own[center + axis] = own[center + axis] + (means2d - means2d.detach())[..., axis]
-        own[DEPTH] = own[DEPTH] if weights is None else weights
-        others = [part[: self.primitive.graded].clone() for _, part in frozen]
-        for part in others if weights is not None else ():
-            part[DEPTH] = 0.0
-        rows = torch.cat((torch.stack(own).flatten(1), *others), dim=1)
-        bounds = torch.cat((*planes.detach(), *(part for _, part in frozen)), dim=1)
-        counts = [planes.shape[2]] * len(shots) + [part.shape[1] for _, part in frozen]
-        places = [*range(len(shots)), *(k for k, _ in frozen)]
-        picture = _repeated(places, counts, planes)
-        lists = reference.find_lists(bounds, picture, [s.crop for s in shots], self.tile_side, self.primitive)
-        if any(window is not None for window in windows):
-            applies = [shot.frozen is None for shot in shots] + [True] * len(frozen)
-            lists = lists.within(windows, _repeated(applies, counts, planes))
-        images, drawn = reference.composite(rows, lists, self.primitive), rows.detach()
-
-        def find(residuals: Sequence[Tensor]) -> Float[Tensor, "v n 10"]:
-            sums = reference.residual_sums(drawn, lists, self.primitive, residuals)
-            return sums[: means2d[..., 0].numel()].view(*means2d.shape[:2], -1)
-
-        return images, SumsApart(find)
+        return tuple(Raster(*picture, info) for picture in pictures)
 
     @torch.no_grad()
     def cuts(
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
-        crops = [shot.crop for shot in shots]
-        for few in runs(shots, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE):
-            yield from self._cut_together(gaussians, few, sh_degree, antialiased)
-
-    def _cut_together(
-        self, gaussians: Gaussians, shots: Sequence[CutShot], sh_degree: int, antialiased: bool
-    ) -> list[Cut]:
-        planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
-        front, inside, back = ([getattr(shot, n) for shot in shots] for n in ("front", "inside", "back"))
-        lists = self._lists(gaussians, planes, [shot.crop for shot in shots])
-        kept_ids = self._kept_ids(lists, inside, len(gaussians), len(shots))
-        layers = zip(*(self._layers(lists, planes, each) for each in (front, back)), strict=True)
-        return [
-            Cut(*both, Splats(own.index_select(1, which)), which)
-            for both, own, which in zip(layers, planes, kept_ids, strict=True)
-        ]
+        for few in _a_few(shots, [shot.crop for shot in shots], gaussians):
+            planes = self._project(gaussians, [shot.view for shot in few], sh_degree, antialiased)
+            lists = self._lists(gaussians, _each_a_picture(planes), [shot.crop for shot in few])
+            kept = lists.kept_ids([shot.inside for shot in few]).view(len(few), len(gaussians))
+            fronts, backs = ([s.front for s in few], [s.back for s in few])
+            for own, held, *sides in zip(planes, kept, lists.draw(fronts), lists.draw(backs), strict=True):
+                front, back = (Layer(color, left) for color, left, _ in sides)
+                which = held.nonzero()[:, 0]
+                yield Cut(front, back, Splats(own.index_select(1, which)), which)
 
     @torch.no_grad()
     def depth_windows(
@@ -194,33 +124,12 @@ class TorchRasterizer(Rasterizer):
         antialiased: bool = False,
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows. A few views are drawn in one pass."""
-        crops = [crop for _, crop in seen]
-        for few in runs(seen, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE):
-            yield from self._windows_together(gaussians, few, visible, antialiased)
-
-    def _windows_together(
-        self, gaussians: Gaussians, seen: Sequence[tuple[View, Crop]], visible: float, antialiased: bool
-    ) -> list[ZWindow]:
-        planes = self._project(gaussians, [view for view, _ in seen], 0, antialiased)
-        crops = [crop for _, crop in seen]
-        grids = [self.window_grid(crop) for crop in crops]
-        native_too = self.window_side == self.tile_side
-        lists = self._lists(gaussians, planes, crops, native_too)
-        if isinstance(lists, native.Lists):
-            ends = [window_between(*each).flatten(1) for each in lists.shown(visible)]
-            return [ZWindow(grid, *both) for grid, both in zip(grids, ends, strict=True)]
-        weight = reference.pair_weights(self._drawn(planes), lists, self.primitive)
-        found, ends = [], torch.searchsorted(lists.tile, lists.tile.new_tensor(lists.starts)).tolist()
-        for k, (grid, drawn_in) in enumerate(zip(grids, lists.grids, strict=True)):
-            own = slice(ends[k], ends[k + 1])
-            held = grid.holding(drawn_in, lists.tile[own] - lists.starts[k])
-            # By tile, then by depth, where tiles of windows hold several.
-            order = lists.z[own].sort(stable=True).indices
-            order = order[held[order].sort(stable=True).indices]
-            of_pairs = (values[own][order] for values in (lists.z, weight))
-            both = showing(grid.pixels(held.device)[None], held[order], *of_pairs, visible).flatten(1)
-            found.append(ZWindow(grid, *both))
-        return found
+        for few in _a_few(seen, [crop for _, crop in seen], gaussians):
+            views, crops = zip(*few, strict=True)
+            planes = self._project(gaussians, views, 0, antialiased)
+            shown = self._lists(gaussians, _each_a_picture(planes), crops).shown(visible)
+            for crop, ends in zip(crops, shown, strict=True):
+                yield ZWindow(self.window_grid(crop), *ends)
 
     @torch.no_grad()
     def deepened(
@@ -238,62 +147,45 @@ class TorchRasterizer(Rasterizer):
             window: where in each tile fragments count; None for everywhere.
             in_front: the same of the others; for none 1 and 0.
         """
-        planes = self._project(gaussians, [view], 0, antialiased)
-        lists, (left, depth) = self._lists(gaussians, planes, [view.full]), in_front
+        left, depth = in_front
         state = torch.stack((torch.where(left > 0.5, left, -left), depth))
-        if isinstance(lists, native.Lists):
-            lists.deepen([window], *state)
-        else:
-            lists = lists if window is None else lists.within([window])
-            state = reference.deepen(self._drawn(planes), lists, self.primitive, state)
+        planes = self._project(gaussians, [view], 0, antialiased)
+        self._lists(gaussians, _each_a_picture(planes), [view.full]).deepen([window], *state)
         return state[0].abs(), state[1]
+
+    def _suits(self, gaussians: Gaussians) -> bool:
+        known = gaussians.features_rest.shape[1] in native.COEFFICIENTS
+        return self._use_native and known and suits(gaussians.means)
+
+    def _project(
+        self, gaussians: Gaussians, views: Sequence[View], sh_degree: int, antialiased: bool
+    ) -> Float[Tensor, "v r n"]:
+        check_degree(gaussians, sh_degree)
+        cameras = [camera_numbers(view, gaussians.means, sh_degree, antialiased) for view in views]
+        learns_poses = torch.is_grad_enabled() and any(camera.requires_grad for camera in cameras)
+        if learns_poses or not self._suits(gaussians):
+            return project_in_torch(gaussians, cameras, self.primitive)
+        return native.project(gaussians, torch.stack(cameras).detach(), self.primitive)
 
     def _lists(
         self,
         gaussians: Gaussians,
-        planes: Float[Tensor, "v r n"],
+        parts: Sequence[native.Part],
         crops: Sequence[Crop],
-        native_too: bool = True,
+        windows: native.Windows = (),
+        wants_weights: bool = False,
     ) -> native.Lists | reference.Lists:
-        """What several views see, as one drawing; columns are numbered through, view by view."""
-        if native_too and self._suits(gaussians):
-            return native.Lists([native.Part(own, k) for k, own in enumerate(planes)], crops, self.primitive)
-        picture = _repeated(range(len(planes)), [planes.shape[2]] * len(planes), planes)
-        return reference.find_lists(_side_by_side(planes), picture, crops, self.tile_side, self.primitive)
-
-    def _drawn(self, planes: Float[Tensor, "v r n"]) -> Float[Tensor, "d vn"]:
-        """What compositing reads of several views."""
-        return _side_by_side(planes[:, : self.primitive.graded])
-
-    def _kept_ids(
-        self, lists: native.Lists | reference.Lists, windows: Sequence[ZWindow], count: int, views: int
-    ) -> list[Int[Tensor, "m"]]:
-        """By view the Gaussians with a pair in the window, ascending."""
-        if isinstance(lists, native.Lists):
-            return [own.nonzero()[:, 0] for own in lists.kept_ids(windows).view(views, count)]
-        found = lists.within(windows).column.unique()
-        firsts = torch.arange(views + 1, device=found.device) * count
-        ends = torch.searchsorted(found, firsts).tolist()
-        return [found[a:b] - k * count for k, (a, b) in enumerate(itertools.pairwise(ends))]
-
-    def _layers(
-        self, lists: native.Lists | reference.Lists, planes: Tensor, windows: Sequence[ZWindow]
-    ) -> list[Layer]:
-        if isinstance(lists, native.Lists):
-            return [Layer(color, left) for color, left, _ in lists.draw(windows)]
-        images = reference.composite(self._drawn(planes), lists.within(windows), self.primitive)
-        return [Layer(image[1:4].permute(1, 2, 0), image[0]) for image in images]
+        if self._suits(gaussians):
+            return native.Lists(parts, crops, self.primitive, windows, wants_weights)
+        return reference.find_lists(parts, crops, self.primitive, windows, self.tile_side)
 
 
-def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
-    """The columns of all views, one view after the other."""
-    return planes.transpose(0, 1).flatten(1)
+def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -> Iterator[list[Item]]:
+    return runs(items, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE)
 
 
-def _repeated(values: Sequence[int | bool], counts: Sequence[int], like: Tensor) -> Tensor:
-    """Each value as often as its count, on the device of `like`."""
-    values, counts = (torch.tensor(list(each), device=like.device) for each in (values, counts))
-    return torch.repeat_interleave(values, counts)
+def _each_a_picture(planes: Float[Tensor, "v r n"]) -> list[native.Part]:
+    return [native.Part(own, k) for k, own in enumerate(planes)]
 
 
 def _info(

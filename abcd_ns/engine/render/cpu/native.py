@@ -13,9 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.native import address, library
 from abcd_ns.engine.render.primitive import Primitive
-from abcd_ns.engine.render.residual_sums import SUMS
+from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.z_window import ZWindow, window_between
 from abcd_ns.engine.types import Crop, Gaussians
 
 SIDE = 4
@@ -102,10 +102,12 @@ class Part:
 
 Windows = Sequence[ZWindow | None]
 """Of each picture; None masks nothing."""
+Pictures = list[tuple[Float[Tensor, "_h _w 3"], Float[Tensor, "_h _w"], Float[Tensor, "_h _w"]]]
+"""Colour, transmittance and depth."""
 
 
 class Lists:
-    """What each tile of some pictures has to draw, front to back.
+    """What each tile of some pictures has to draw, front to back; and, once it was drawn, ResidualSums.
 
     Args:
         windows: leave out of masked parts what lies outside.
@@ -117,74 +119,90 @@ class Lists:
         parts: Sequence[Part],
         crops: Sequence[Crop],
         primitive: Primitive,
-        windows: Windows = (),
-        wants_weights: bool = False,
+        windows: Windows,
+        wants_weights: bool,
     ) -> None:
         self.primitive, self.crops = primitive, tuple(crops)
+        self.values: Tensor | None = None
+        self.residuals: list[Tensor] | None = None
+        self.absolute: Tensor | None = None
+        """Gets gsplat's `absgrad` [v, n, 2] with the gradients, where no residuals are asked."""
         self._parts = [part.planes.detach().contiguous() for part in parts]  # read when gradients are taken
-        self.columns = sum(planes.shape[1] for planes in self._parts)
         rows = [
             _Part(address(planes), planes.shape[1], planes.shape[1], part.picture, part.masked)
             for planes, part in zip(self._parts, parts, strict=True)
         ]
-        pictures, counts = self._pictures(windows), (ctypes.c_int64(len(each)) for each in (rows, crops))
+        pictures, counts = (
+            _Windowed(self.crops, windows),
+            (ctypes.c_int64(len(each)) for each in (rows, crops)),
+        )
         given = ((_Part * len(rows))(*rows), next(counts), pictures.rows, next(counts))
         self.handle = _POINTER(
             library().abcd_lists(int(primitive.name == "2dgs"), *given, int(wants_weights))
         )
         weakref.finalize(self, library().abcd_free, self.handle)
 
-    def _pictures(self, windows: Windows) -> "_Pictures":
-        return _Pictures(self.crops, windows or [None] * len(self.crops))
-
-    def _images(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        shapes = [(crop.height, crop.width) for crop in self.crops]
-        return [(torch.empty((*s, 3)), torch.empty(s), torch.empty(s)) for s in shapes]
-
-    def draw(self, windows: Windows = (), keep: bool = False) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Colour [h, w, 3], transmittance and depth [h, w] of what lies in the windows, by picture.
+    def draw(self, windows: Windows = (), keep: bool = False) -> Pictures:
+        """What lies in the windows.
 
         Args:
             keep: whether gradients will be asked for; without windows.
         """
-        images = self._images()
-        pictures = self._pictures(windows)
+        sizes = [(crop.height, crop.width) for crop in self.crops]
+        images = [(torch.empty((*size, 3)), torch.empty(size), torch.empty(size)) for size in sizes]
+        pictures = _Windowed(self.crops, windows)
         library().abcd_draw(self.handle, pictures.rows, _as_images(images), int(keep))
         return images
 
+    def composite(
+        self, planes: Float[Tensor, "v r n"], means2d: Float[Tensor, "v n 2"], weights: Tensor | None
+    ) -> tuple[Pictures, ResidualSums]:
+        """The pictures, differentiable in the planes of the first parts, one for each picture.
+
+        Args:
+            means2d: does not change what is drawn, and gets the gradients of the middles.
+            weights: [v, n], likewise of the depths.
+        """
+        drawn = iter(_Composite.apply(planes, means2d, weights, self))
+        return list(zip(drawn, drawn, drawn, strict=True)), self
+
+    def ask(self, residuals: Sequence[Tensor]) -> None:
+        """See ResidualSums."""
+        self.residuals = [residual.contiguous() for residual in residuals]
+
     def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:
         """Which columns, numbered part by part, have a fragment in the windows."""
-        found: UInt8[Tensor, n] = torch.zeros(self.columns, dtype=torch.uint8)
-        pictures = self._pictures(windows)
+        columns = sum(planes.shape[1] for planes in self._parts)
+        found: UInt8[Tensor, n] = torch.zeros(columns, dtype=torch.uint8)
+        pictures = _Windowed(self.crops, windows)
         library().abcd_members(self.handle, pictures.rows, _POINTER(found.data_ptr()))
         return found.bool()
 
-    def shown(self, visible: float) -> list[tuple[Float[Tensor, "1 t"], ...]]:
-        """By picture the arguments of z_window.window_between."""
+    def shown(self, visible: float) -> list[Float[Tensor, "2 _t"]]:
+        """By picture what z_window.showing returns."""
         sizes = [TileGrid(crop, SIDE).tiles for crop in self.crops]
         ends = torch.empty((2, sum(sizes)))
         sums = torch.empty((2, sum(sizes)), dtype=torch.float64)
         pointers = [_POINTER(row.data_ptr()) for row in (*ends, *sums)]
         library().abcd_windows(self.handle, ctypes.c_float(visible), *pointers)
         parts = (row[None].split(sizes, dim=1) for row in (*ends, *sums))
-        return list(zip(*parts, strict=True))
+        return [window_between(*each).flatten(1) for each in zip(*parts, strict=True)]
 
-    def deepen(self, windows: Windows, left: Tensor, depth: Tensor) -> None:
-        """Signed transmittance and median depth [h, w] of the one picture, in place; see cpp/drawing.h."""
-        pictures = self._pictures(windows)
+    def deepen(self, windows: Windows, left: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> None:
+        """Transmittance, negative where it is a half or less, and median depth of the one picture, in place:
+        from what is in front of these Gaussians to what is with them. See cpp/drawing.h."""
+        pictures = _Windowed(self.crops, windows)
         library().abcd_deepen(self.handle, pictures.rows, _as_images([(None, left, depth)]))
 
 
-class _Pictures:
+class _Windowed:
     """Crops and windows as the library takes them, for one call; holds the tensors meanwhile."""
 
     def __init__(self, crops: Sequence[Crop], windows: Windows) -> None:
-        on = [None if w is None else w.on(TileGrid(c, SIDE)) for c, w in zip(crops, windows, strict=True)]
+        pairs = zip(crops, windows or [None] * len(crops), strict=True)
+        on = [window and window.on(TileGrid(crop, SIDE)) for crop, window in pairs]
         self._ends = [(None, None) if w is None else (w.near.contiguous(), w.far.contiguous()) for w in on]
-        rows = [
-            _Picture(crop.x, crop.y, crop.width, crop.height, *map(address, ends))
-            for crop, ends in zip(crops, self._ends, strict=True)
-        ]
+        rows = [_Picture(*crop, *map(address, ends)) for crop, ends in zip(crops, self._ends, strict=True)]
         self.rows = (_Picture * len(rows))(*rows)
 
 
@@ -192,49 +210,26 @@ def _as_images(images: Sequence[Sequence[Tensor | None]]) -> ctypes.Array:
     return (_Image * len(images))(*(_Image(*map(address, image)) for image in images))
 
 
-@dataclass
-class Drawing:
-    """What compositing needs besides tensors that take gradients: ResidualSums, too."""
-
-    lists: Lists
-    residuals: list[Tensor] | None = None
-    values: Tensor | None = None
-    """See ResidualSums."""
-    means2d: Tensor | None = None
-    """Gets gsplat's `absgrad` [v, n, 2], if given; then no residuals are asked."""
-
-    def ask(self, residuals: Sequence[Tensor]) -> None:
-        """See ResidualSums."""
-        self.residuals = [residual.contiguous() for residual in residuals]
-
-
-class Composite(torch.autograd.Function):
-    """Planes [v, r, n] of what takes gradients -> colour, transmittance and depth of each picture.
-
-    `means2d` [v, n, 2] and `weights` [v, n] or None do not change what is drawn: they get gradients, of the
-    middles and of the depths.
-    """
+class _Composite(torch.autograd.Function):
+    """See Lists.composite."""
 
     @staticmethod
     def forward(
-        ctx: Any, planes: Tensor, _: Tensor, weights: Tensor | None, drawing: Drawing
+        ctx: Any, planes: Tensor, _: Tensor, weights: Tensor | None, lists: Lists
     ) -> tuple[Tensor, ...]:
-        keep = any(ctx.needs_input_grad)
-        images = drawing.lists.draw(keep=keep)
+        images = lists.draw(keep=any(ctx.needs_input_grad))
         outputs = tuple(tensor for image in images for tensor in image)
         ctx.save_for_backward(*outputs)
-        ctx.shape, ctx.drawing, ctx.wants_weights = planes.shape, drawing, weights is not None
+        ctx.shape, ctx.lists, ctx.wants_weights = planes.shape, lists, weights is not None
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        drawing, (views, _, n) = ctx.drawing, ctx.shape
-        lists, center = drawing.lists, drawing.lists.primitive.center
+        lists, (views, _, n), residuals = ctx.lists, ctx.shape, ctx.lists.residuals
         rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.wants_weights else None
-        residuals = drawing.residuals
-        width = SUMS if residuals else 0 if drawing.means2d is None else 2
+        width = SUMS if residuals else 0 if lists.absolute is None else 2
         extra = torch.zeros((views, n, width)) if width else None
         held = [None if grad is None else grad.contiguous() for grad in grads]
         asked = [held[k : k + 3] for k in range(0, len(held), 3)]
@@ -250,7 +245,8 @@ class Composite(torch.autograd.Function):
             ctypes.c_int64(width),
         )
         if residuals:
-            drawing.values = extra
-        elif drawing.means2d is not None:
-            drawing.means2d.absgrad = extra
-        return rows, rows[:, center : center + 2].transpose(1, 2).contiguous(), weights, None
+            lists.values = extra
+        elif lists.absolute is not None:
+            lists.absolute.absgrad = extra
+        center = slice(lists.primitive.center, lists.primitive.center + 2)
+        return rows, rows[:, center].transpose(1, 2).contiguous(), weights, None

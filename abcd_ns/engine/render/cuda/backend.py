@@ -34,7 +34,7 @@ BYTES_PER_FOOTPRINT = 100
 class GsplatRasterizer(Rasterizer):
     """gsplat 1.4.0 on CUDA, float32. The picture of a crop is that of the full image."""
 
-    window_side = TILE
+    tile_side = TILE
 
     def __init__(self, primitive: PrimitiveName = "3dgs") -> None:
         self.primitive, self._kind = PRIMITIVES[primitive], KINDS[primitive]
