@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
-from abcd_ns.engine.layers.fog import fog_in_white
+from abcd_ns.engine.layers.surface import fog_in_white
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
