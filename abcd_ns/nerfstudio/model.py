@@ -19,9 +19,8 @@ from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
-from abcd_ns.engine.layers.fog import fog_in_white
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Ownership, RenderSettings, default_pass
-from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
+from abcd_ns.engine.layers.surface import colored_by_normal, fog_in_white, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, psnr, squared_errors, ssim_windows
 from abcd_ns.engine.space.partition import build_kd

@@ -10,8 +10,8 @@ import torch
 
 from abcd_ns.engine.layers.compositing import fold, sandwich
 from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
-from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.rasterizer_scenes import (
     as_leaves,

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import photometric_sums
 from abcd_ns.engine.layers.compositing import composite, sandwich
+from abcd_ns.engine.render.base import Shown
 from abcd_ns.engine.render.cuda import fused
-from abcd_ns.engine.render.cuda.frame import Shown
 from abcd_ns.engine.types import Layer
 from tests.reference import simulated_device
 

@@ -51,7 +51,7 @@ class HeldOut:
     shown: tuple[Shown, ...]
     """From best to worst."""
     fog: tuple[float, ...] = ()
-    """Shares of the screen that fog takes in a few training views; see `engine/layers/fog.py`."""
+    """Shares of the screen that fog takes in a few training views; see `engine/layers/surface.py`."""
 
     def mean(self, name: str) -> float | None:
         """Over all views, of a field of their scores."""

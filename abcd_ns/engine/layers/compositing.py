@@ -8,6 +8,7 @@ It is associative, so any run of layers collapses into one; the empty layer (0, 
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -33,19 +34,10 @@ def fold(layers: Sequence[Layer], like: Layer | None = None) -> Layer:
 
     Args:
         like: gives size, dtype and device of the empty layer that no layers at all fold to.
-
-    Raises:
-        ValueError: neither layers nor `like` given.
     """
-    if not layers:
-        if like is None:
-            raise ValueError("cannot fold no layers without knowing their size: pass like=")
-        height, width = like.transmittance.shape
-        return empty_layer(height, width, like.color.device, like.color.dtype)
-    folded = layers[0]
-    for layer in layers[1:]:
-        folded = over(folded, layer)
-    return folded
+    if layers:
+        return reduce(over, layers)
+    return empty_layer(*like.transmittance.shape, like.color.device, like.color.dtype)
 
 
 def composite(

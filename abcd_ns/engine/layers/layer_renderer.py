@@ -18,8 +18,7 @@ from abcd_ns.engine.render import CutShot, Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, intersection
 from abcd_ns.engine.space.intervals import ray_interval
-from abcd_ns.engine.space.ordering import node_children_in_order, nodes_in_order
-from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View

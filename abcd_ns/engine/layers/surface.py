@@ -1,6 +1,7 @@
-"""Which way what a pixel shows faces, and how far away most of it is: of a whole scene, node by node.
+"""What else than colour pictures of a scene tell: normals, median depth, and fog.
 
-Nothing of this is drawn unless it is asked for.
+Fog is Gaussians between a camera and all that its photo is known to show. They imitate what differs from
+photo to photo, as vignettes do, and veil other views. Nothing of this is drawn unless it is asked for.
 """
 
 from dataclasses import replace
@@ -12,12 +13,14 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
-from abcd_ns.engine.render import Raster, Rasterizer
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.types import Gaussians, View
 
 UPRIGHT = 2
 """The axis of a surfel's normal; an ellipsoid's is that of its least scale."""
+NEARER = 0.85
+"""Of the view's nearest point: Gaussians with a smaller camera z are fog."""
 
 
 def normals_of(gaussians: Gaussians, center: Float[Tensor, "3"], flat: bool) -> Float[Tensor, "n 3"]:
@@ -60,6 +63,16 @@ def normals_in(raster: Raster) -> Float[Tensor, "h w 3"]:
     return F.normalize(2 * raster.color - (1 - raster.transmittance)[..., None], dim=-1)
 
 
+def fog_in_white(gaussians: Gaussians, view: View) -> Gaussians:
+    """The same with fog white and all else black: the mean of their picture, drawn with harmonics of degree 0
+    before black, is the share of the screen that fog takes."""
+    matrix = view.viewmat.to(gaussians.means)
+    z = gaussians.means @ matrix[2, :3] + matrix[2, 3]
+    white = torch.where(z < NEARER * view.nearest, 0.5, -0.5) / SH_C0
+    dark = torch.zeros_like(gaussians.features_rest)
+    return replace(gaussians, features_dc=white[:, None].expand(-1, 3).contiguous(), features_rest=dark)
+
+
 @torch.no_grad()
 def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) -> Float[Tensor, "h w"]:
     """Camera z of the Gaussian at which half of each pixel is covered, world units: the last that is drawn
@@ -70,12 +83,13 @@ def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) 
     ray. Here a node goes on from the transmittance that those in front leave, so that any division by
     fragments gives the same.
     """
-    rasterizer = _torch(renderer.rasterizer)
+    rasterizer = renderer.rasterizer
+    if not isinstance(rasterizer, TorchRasterizer):
+        options = {"tile_side": rasterizer.tile_side, "primitive": rasterizer.primitive.name}
+        rasterizer = TorchRasterizer(use_native=False, **options)
     like = {"device": renderer.device, "dtype": view.viewmat.dtype}
-    left, depth = (
-        torch.ones((view.height, view.width), **like),
-        torch.zeros((view.height, view.width), **like),
-    )
+    left = torch.ones((view.height, view.width), **like)
+    depth = torch.zeros_like(left)
     seen_by = renderer.frusta([(view, view.full)])
     for node in renderer.order(renderer.nodes(), view):
         if float(left.max()) <= 0.5:
@@ -87,11 +101,3 @@ def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) 
                 gaussians, view, window, (left, depth), antialiased=settings.antialiased
             )
     return depth
-
-
-def _torch(rasterizer: Rasterizer) -> TorchRasterizer:
-    if isinstance(rasterizer, TorchRasterizer):
-        return rasterizer
-    return TorchRasterizer(
-        use_native=False, tile_side=16, primitive=rasterizer.primitive.name
-    )  # gsplat's tiles

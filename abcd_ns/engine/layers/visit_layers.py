@@ -12,7 +12,6 @@ from abcd_ns.engine.layers.layer_renderer import (
     PARTS_BYTES,
     FrozenLayers,
     LayerRenderer,
-    Loaded,
     RenderSettings,
     Seen,
 )
@@ -88,11 +87,15 @@ class VisitLayers:
         """All nodes one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         block = self._geometry.block
+        seen = [
+            Seen(self._views[view], self._geometry.crops[view], self._windows.get(view)) for view in views
+        ]
         parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
         for node in self._nodes:
             loaded = self._renderer.load(node, exclude=block, seen_by=self._seen_by)
             self._loaded[node] = len(loaded.gaussians)
-            for view, part in zip(views, self._render(node, loaded, views), strict=True):
+            drawn = self._renderer.render(node, loaded, seen, self._settings, active=block)
+            for view, part in zip(views, drawn, strict=True):
                 parts[view][node] = part
                 self._renderer.fold_up(parts[view], node, self._views[view])
                 if node == self._nodes[-1]:
@@ -113,7 +116,7 @@ class VisitLayers:
         layers = kept.layers[(slice(None), *part.within(whole).slices)]
         if layers.device.type == "cpu":  # elsewhere what reads them does so
             layers = layers.to(self._views[view].viewmat.dtype)
-        layers, window = unpacked(layers), self._window(view)
+        layers, window = unpacked(layers), self._windows.get(view)  # None by means
         window = window and window.on(TileGrid(part, window.grid.side))
         return replace(layers, inside=kept.interleaved), window
 
@@ -133,13 +136,6 @@ class VisitLayers:
             antialiased=self._settings.antialiased,
         )
         self._windows.update(zip(new, found, strict=True))
-
-    def _window(self, view: int) -> ZWindow | None:
-        return None if self._own is None else self._windows[view]
-
-    def _render(self, node: int, loaded: Loaded, views: Sequence[int]) -> Iterator[FrozenLayers | None]:
-        seen = [Seen(self._views[view], self._geometry.crops[view], self._window(view)) for view in views]
-        return self._renderer.render(node, loaded, seen, self._settings, active=self._geometry.block)
 
     def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:
         folded = self._renderer.fold(parts, self._views[view], self._geometry.crops[view])

@@ -3,15 +3,14 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import Primitive
-from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.projection import Splats, extents_of
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
@@ -34,6 +33,20 @@ class Raster:
     @property
     def layer(self) -> Layer:
         return Layer(self.color, self.transmittance)
+
+
+class Frame(NamedTuple):
+    """What a drawn crop is shown in: two layers or none, a background, and what a pixel weighs."""
+
+    front: Layer | None
+    back: Layer | None
+    background: Float[Tensor, "3"]
+    counts: float
+    """The gradient by the depth of a pixel that nothing hides, whatever the loss."""
+
+
+Shown = tuple[tuple[slice, slice], Frame]
+"""Rows and columns of a crop in what gsplat has drawn, and its frame."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
 """Gaussians as one camera sees them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
@@ -103,3 +104,23 @@ def check_degree(gaussians: Gaussians, sh_degree: int) -> None:
             f"sh_degree is {sh_degree}, but the Gaussians hold degrees up to {gaussians.sh_degree}, and "
             f"degrees above {MAX_SH_DEGREE} are not supported; lower sh_degree."
         )
+
+
+def extents_of(
+    means2d: Float[Tensor, "*c n 2"], radii: Real[Tensor, "*c n"], view: View
+) -> Float[Tensor, "*c 4"]:
+    """(left, top, right, bottom) of all that may be drawn in the image, px; infinite, the wrong way round,
+    where nothing is.
+
+    Args:
+        means2d: centres in the full image, px.
+        radii: half the sides of their squares, px; 0 where culled.
+        view: gives the size of the image.
+    """
+    low, high = means2d - radii[..., None], means2d + radii[..., None]
+    visible = (radii > 0) & (high > 0).all(dim=-1)
+    visible = (visible & (low[..., 0] < view.width) & (low[..., 1] < view.height))[..., None]
+    if means2d.shape[-2] == 0:
+        return torch.cat((low.new_full((2,), math.inf), low.new_full((2,), -math.inf)))
+    low = torch.where(visible, low, math.inf).amin(dim=-2)
+    return torch.cat((low, torch.where(visible, high, -math.inf).amax(dim=-2)), dim=-1)

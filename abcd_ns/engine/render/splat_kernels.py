@@ -3,8 +3,6 @@
 The reference of kernels/cpp/projection.h.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -44,7 +42,6 @@ X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE = range(10)
 GRADED = BLUE + 1
 COV_XX, COV_XY, COV_YY, RADIUS = range(GRADED, GRADED + 4)
 """then bounds: the 2D covariance, blur included, and gsplat's radius."""
-SPLAT_ROWS = RADIUS + 1
 
 
 def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float[Tensor, "r n"]:
@@ -53,20 +50,11 @@ def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float
     Colours are max(0, SH(direction) + 0.5), linear, not clamped from above. Covariances come as dot products
     of projected axes: never indefinite, and cheaper. Columns with radius 0 are finite and without meaning.
     """
-    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11].unbind(0)
+    *scales, qw, qx, qy, qz, logit = parameters[3:11].unbind(0)
     number = camera.unbind(0)
-    rotation, (tx, ty, tz) = number[:9], number[9:12]
     fx, fy, cx, cy, width, height, antialiased = number[12:19]
-    near = number[22]
-    mx = rotation[0] * x + rotation[1] * y + rotation[2] * z + tx
-    my = rotation[3] * x + rotation[4] * y + rotation[5] * z + ty
-    depth = rotation[6] * x + rotation[7] * y + rotation[8] * z + tz
-    # What lies behind the camera is projected as if at z = 1: any finite value will do, its radius is 0.
-    inverse_z = 1.0 / torch.where(depth >= near, depth, 1.0)
-    slope_x, slope_y = mx * inverse_z, my * inverse_z
-    u, v = fx * slope_x + cx, fy * slope_y + cy
-
-    axes = camera_axes(rotation, (qw, qx, qy, qz), [scale.exp() for scale in scales])
+    depth, inverse_z, slope_x, slope_y, u, v = middles(parameters, number)
+    axes = camera_axes(number[:9], (qw, qx, qy, qz), [scale.exp() for scale in scales])
     # As in gsplat, the Jacobian is taken at a centre clamped to 1.3 times the image's field of view: further
     # out the linearisation explodes.
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
@@ -83,12 +71,26 @@ def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float
 
     opacity = torch.sigmoid(logit)
     opacity = opacity * torch.where(antialiased > 0, _safe_sqrt(det_sharp / det), 1.0)
-    away = [x - number[19], y - number[20], z - number[21]]
-    per_length = torch.rsqrt(dot(away, away).clamp_min(TINY))
-    colors = sh_color(parameters[11:].unbind(0), [value * per_length for value in away], number[23:])
-    rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *colors]
-    bounds = [value.detach() for value in (u, v, depth, xx, xy, yy, det)]
-    return torch.stack([*rows, *bounds[3:6], _radius(*bounds, width, height, near)])
+    rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *sh_color(parameters, number)]
+    x, y, depth, xx, xy, yy, det = (value.detach() for value in (u, v, depth, xx, xy, yy, det))
+    mid = 0.5 * (xx + yy)
+    half = (mid + (mid * mid - det).clamp_min(0.01).sqrt()).sqrt()
+    return torch.stack([*rows, xx, xy, yy, radius_of(x, y, depth, half, det > 0, number)])
+
+
+def middles(parameters: Float[Tensor, "p n"], number: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Camera z of means, 1 / z, x / z and y / z, and pixels (u, v).
+
+    What lies behind the camera is projected as if at z = 1: any finite value will do, its radius is 0.
+    """
+    x, y, z = parameters[:3].unbind(0)
+    rotation, (tx, ty, tz), (fx, fy, cx, cy) = number[:9], number[9:12], number[12:16]
+    mx = rotation[0] * x + rotation[1] * y + rotation[2] * z + tx
+    my = rotation[3] * x + rotation[4] * y + rotation[5] * z + ty
+    depth = rotation[6] * x + rotation[7] * y + rotation[8] * z + tz
+    inverse_z = 1.0 / torch.where(depth >= number[22], depth, 1.0)
+    slope_x, slope_y = mx * inverse_z, my * inverse_z
+    return depth, inverse_z, slope_x, slope_y, fx * slope_x + cx, fy * slope_y + cy
 
 
 def camera_axes(
@@ -109,11 +111,12 @@ def camera_axes(
     ]
 
 
-def sh_color(
-    harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[Tensor, ...]
-) -> list[Tensor]:
+def sh_color(parameters: Float[Tensor, "p n"], number: tuple[Tensor, ...]) -> list[Tensor]:
     """max(0, SH(direction) + 0.5): red, green, blue."""
-    bases = sh_basis_rows(*direction)
+    harmonics, in_use = parameters[11:].unbind(0), number[23:]
+    away = [mean - center for mean, center in zip(parameters[:3].unbind(0), number[19:22], strict=True)]
+    per_length = torch.rsqrt(dot(away, away).clamp_min(TINY))
+    bases = sh_basis_rows(*[value * per_length for value in away])
     # Multiplied, not left out: coefficients of degrees not in use get a gradient of zeros, as gsplat gives
     # them; Adam counts such steps.
     bases = [basis * in_use[sh_degree_of(k)] for k, basis in enumerate(bases)]
@@ -135,10 +138,16 @@ def _safe_sqrt(x: Tensor) -> Tensor:
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
 
 
-def _radius(u, v, depth, xx, _, yy, det, width, height, near) -> Tensor:
-    """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
-    mid = 0.5 * (xx + yy)
-    radius = (3.0 * (mid + (mid * mid - det).clamp_min(0.01).sqrt()).sqrt()).ceil()
-    drawn = (depth >= near) & (depth <= FAR_PLANE) & (det > 0)
-    drawn = drawn & (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
+def radius_of(
+    x: Tensor, y: Tensor, depth: Tensor, half: Tensor, is_sound: Tensor, number: tuple[Tensor, ...]
+) -> Tensor:
+    """3 sigma along the longer axis, rounded up; 0 for what no pixel sees.
+
+    Args:
+        half: one sigma, px.
+    """
+    width, height, near = number[16], number[17], number[22]
+    radius = (3.0 * half).ceil()
+    drawn = (depth >= near) & (depth <= FAR_PLANE) & is_sound
+    drawn = drawn & (x + radius > 0) & (x - radius < width) & (y + radius > 0) & (y - radius < height)
     return torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)

@@ -15,17 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.splat_kernels import (
-    DEPTH,
-    FAR_PLANE,
-    MAX_RADIUS,
-    TINY,
-    X,
-    Y,
-    camera_axes,
-    dot,
-    sh_color,
-)
+from abcd_ns.engine.render.splat_kernels import DEPTH, X, Y, camera_axes, middles, radius_of, sh_color
 
 U, V, A, B, C, D, E, F, OPACITY, RED, GREEN, BLUE = range(DEPTH + 1, DEPTH + 13)
 """Rows that `surfel` gives, after the middle x, y of the box around the ellipse of one standard deviation and
@@ -33,7 +23,6 @@ the camera z: the disc's middle on screen, the matrix, what it looks like,"""
 GRADED = BLUE + 1
 RADIUS = GRADED + 3
 """then, without gradients, nothing in the three rows where splats have bounds, and gsplat's radius."""
-SURFEL_ROWS = RADIUS + 1
 MIN_EXTENT = 1e-4
 """Squared half sides of boxes are clamped to this, px^2."""
 
@@ -43,19 +32,11 @@ def surfel(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Floa
 
     Columns with radius 0 are finite and without meaning.
     """
-    x, y, z, wide, high, _, qw, qx, qy, qz, logit = parameters[:11].unbind(0)
+    wide, high, _, qw, qx, qy, qz, logit = parameters[3:11].unbind(0)
     number = camera.unbind(0)
-    rotation, (tx, ty, tz) = number[:9], number[9:12]
-    fx, fy, cx, cy, width, height = number[12:18]
-    near = number[22]
-    mx = rotation[0] * x + rotation[1] * y + rotation[2] * z + tx
-    my = rotation[3] * x + rotation[4] * y + rotation[5] * z + ty
-    depth = rotation[6] * x + rotation[7] * y + rotation[8] * z + tz
-    inverse_z = 1.0 / torch.where(depth >= near, depth, 1.0)
-    slope_x, slope_y = mx * inverse_z, my * inverse_z
-    u, v = fx * slope_x + cx, fy * slope_y + cy
-
-    axes = camera_axes(rotation, (qw, qx, qy, qz), [wide.exp(), high.exp(), torch.ones_like(wide)])
+    fx, fy = number[12:14]
+    depth, inverse_z, slope_x, slope_y, u, v = middles(parameters, number)
+    axes = camera_axes(number[:9], (qw, qx, qy, qz), [wide.exp(), high.exp(), torch.ones_like(wide)])
     across, down, away = ([component[k] * inverse_z for k in range(2)] for component in axes)
     # Relative to the middle: without the cancellation that large pixel numbers would bring.
     a, b = (fx * (across[k] - slope_x * away[k]) for k in range(2))
@@ -65,20 +46,14 @@ def surfel(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Floa
     off_x = (a * away[0] + b * away[1]) * per_distance
     off_y = (c * away[0] + d * away[1]) * per_distance
 
-    view = [x - number[19], y - number[20], z - number[21]]
-    per_length = torch.rsqrt(dot(view, view).clamp_min(TINY))
-    colors = sh_color(parameters[11:].unbind(0), [value * per_length for value in view], number[23:])
+    colors = sh_color(parameters, number)
     matrix = [a + u * away[0], b + u * away[1], c + v * away[0], d + v * away[1], *away]
     rows = [u + off_x, v + off_y, depth, u, v, *matrix, torch.sigmoid(logit), *colors]
     extents = (off_x * off_x - (a * a + b * b) * per_distance, off_y * off_y - (c * c + d * d) * per_distance)
     extent_x, extent_y = (extent.detach() for extent in extents)
-    radius = (3.0 * extent_x.maximum(extent_y).clamp_min(MIN_EXTENT).sqrt()).ceil()
-    box_x, box_y = rows[X].detach(), rows[Y].detach()
-    drawn = (depth >= near) & (depth <= FAR_PLANE) & (distance != 0)
-    drawn = drawn & (box_x + radius > 0) & (box_x - radius < width)
-    drawn = drawn & (box_y + radius > 0) & (box_y - radius < height)
-    nothing = torch.zeros_like(radius)
-    return torch.stack([*rows, *[nothing] * 3, torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)])
+    half = extent_x.maximum(extent_y).clamp_min(MIN_EXTENT).sqrt()
+    radius = radius_of(rows[X].detach(), rows[Y].detach(), depth.detach(), half, distance != 0, number)
+    return torch.stack([*rows, *[torch.zeros_like(radius)] * 3, radius])
 
 
 def relative_matrix(rows: Sequence[Tensor]) -> tuple[Tensor, ...]:

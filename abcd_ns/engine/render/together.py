@@ -1,6 +1,6 @@
 """What is drawn in one pass, where each view drawn alone would cost more in calls than in work."""
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 from abcd_ns.engine.types import Crop
@@ -17,33 +17,26 @@ def runs(
     *,
     gaussians: int = 0,
     splats: int = 0,
-    kinds: Sequence[Hashable] | None = None,
     padded: bool = False,
 ) -> Iterator[list[Item]]:
-    """The items, a crop each, in runs of neighbours of one kind.
+    """The items, a crop each, in runs of neighbours.
 
     Args:
         pixels: most of a run of more than one.
         gaussians: that are drawn in each crop, if they are limited, too.
         splats: most of these in all crops of a run of more than one.
-        kinds: of each item; None if they are all alike.
         padded: each crop is drawn as large as the largest of its run.
     """
     run: list[Item] = []
     taken: list[Crop] = []
-    kind = None
-    for item, crop, own in zip(items, crops, kinds or [None] * len(items), strict=True):
+    for item, crop in zip(items, crops, strict=True):
         taken.append(crop)
-        drawn = _padded(taken) if padded else sum(each.pixels for each in taken)
-        if run and (own != kind or drawn > pixels or (len(run) + 1) * gaussians > splats):
+        drawn = sum(each.pixels for each in taken)
+        if padded:
+            drawn = len(taken) * max(each.width for each in taken) * max(each.height for each in taken)
+        if run and (drawn > pixels or (len(run) + 1) * gaussians > splats):
             yield run
             run, taken = [], [crop]
-        kind = own
         run.append(item)
     if run:
         yield run
-
-
-def _padded(crops: Sequence[Crop]) -> int:
-    """Pixels of so many crops, as wide and as high as any of them."""
-    return len(crops) * max(crop.width for crop in crops) * max(crop.height for crop in crops)

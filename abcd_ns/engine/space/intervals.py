@@ -9,7 +9,7 @@ so its parameter is camera z itself. It crosses the plane x_k = s at z = (s - c_
 Cells tile space, and their intervals must tile z just as exactly, or fragments would be drawn twice or
 never. Three rules see to that, with no tolerance anywhere:
 
-1. Which side of a plane the camera is on is decided as in ordering.py: in float64, right if c_k >= s.
+1. Which side of a plane the camera is on is decided as by BlockTree.assign: in float64, right if c_k >= s.
 2. The side with the camera gets [start, crossing), the other one [crossing, end). A ray that runs along
    the plane or away from it never crosses: then the crossing is +inf and the other side gets nothing.
 3. Both sides compute the crossing by the same two rounded operations. These are monotone in s, so a

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.fog import NEARER, fog_in_white
+from abcd_ns.engine.layers.surface import NEARER, fog_in_white
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views

@@ -10,9 +10,8 @@ from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, 
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.intervals import ray_interval
-from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_grid, build_kd
-from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
 from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error

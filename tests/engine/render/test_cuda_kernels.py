@@ -28,7 +28,7 @@ for height, width in ((11, 11), (11, 40), (29, 12), (33, 61)):
 BETWEEN = """
 import torch
 from abcd_ns.engine.render.cuda.between import between
-from abcd_ns.engine.render.cuda.frame import Frame
+from abcd_ns.engine.render.base import Frame
 from abcd_ns.engine.types import Layer
 from tests.reference import triton_stand_ins as twins
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.render import ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions, ray_interval
-from abcd_ns.engine.space.ordering import front_to_back
-from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.space.tree import BlockTree, Box, front_to_back
 from abcd_ns.engine.types import Crop, View
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
 from tests.reference.scenes import cell_windows

@@ -7,9 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_grid
-from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
 
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
+from abcd_ns.engine.render.projection import extents_of
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions

@@ -8,7 +8,7 @@ import torch
 
 from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.layers.compositing import composite, fold
-from abcd_ns.engine.space.ordering import front_to_back
+from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.special_blocks import LIVE, PENDING, WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth

@@ -5,6 +5,7 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 import gsplat
@@ -14,12 +15,11 @@ from torch import Tensor
 
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cuda.drawn import Drawn
-from abcd_ns.engine.render.cuda.kinds import KINDS
+from abcd_ns.engine.render.cuda.kinds import kind_of
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
-from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
-from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.cuda.projection import Projected, place_on_screen, project
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
-from abcd_ns.engine.render.projection import Splats, check_degree
+from abcd_ns.engine.render.projection import Splats, check_degree, extents_of
 from abcd_ns.engine.render.residual_sums import SumsApart
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
@@ -37,9 +37,8 @@ class GsplatRasterizer(Rasterizer):
     tile_side = TILE
 
     def __init__(self, primitive: PrimitiveName = "3dgs") -> None:
-        self.primitive, self._kind = PRIMITIVES[primitive], KINDS[primitive]
+        self.primitive, self._kind = PRIMITIVES[primitive], kind_of(primitive)
         self.name = f"{self.primitive.prefix}gsplat-{gsplat.__version__}"
-        self._cameras = Cameras()
 
     def warm_up(self) -> None:
         """Nothing: gsplat compiles at its first call, which is the self-check's."""
@@ -50,7 +49,7 @@ class GsplatRasterizer(Rasterizer):
     ) -> Splats:
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
-        return self._seen(gaussians, [view], sh_degree, antialiased).splats(0)
+        return project(self._kind, gaussians, [view], sh_degree, antialiased).splats(0)
 
     @torch.no_grad()
     def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
@@ -59,11 +58,11 @@ class GsplatRasterizer(Rasterizer):
             return super().extents(gaussians, views)
         most = max(FOOTPRINT_BYTES // (BYTES_PER_FOOTPRINT * len(gaussians)), 1)
         found: list[Tensor] = [torch.empty(0)] * len(views)
-        for places in _alike([(view.width, view.height, view.near) for view in views]):
+        for places in _alike([_size(view) for view in views]):
             for k in range(0, len(places), most):
                 part = places[k : k + most]
                 seen = [views[place] for place in part]
-                (radii, means2d, *_), _ = place_on_screen(self._kind, gaussians, seen, self._cameras)
+                (radii, means2d, *_), _ = place_on_screen(self._kind, gaussians, seen)
                 for place, extent in zip(part, extents_of(means2d, radii, seen[0]), strict=True):
                     found[place] = extent
         return torch.stack(found).cpu()
@@ -82,7 +81,7 @@ class GsplatRasterizer(Rasterizer):
         check_degree(gaussians, sh_degree)
         rasters: dict[int, Raster] = {}
         # Windows mask what is frozen, or the Gaussians: no list has both.
-        kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
+        kinds = [(_size(shot.view), shot.frozen is None) for shot in shots]
         for places in _alike(kinds):
             alike = [shots[k] for k in places]
             drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, blend_weights, judge)
@@ -99,10 +98,8 @@ class GsplatRasterizer(Rasterizer):
         check_degree(gaussians, sh_degree)
         for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
             views, crops = [shot.view for shot in few], [shot.crop for shot in few]
-            seen = self._seen(gaussians, views, sh_degree, antialiased)
-            drawing = Drawing.of(
-                self._kind, FlatSplats.of(seen, self._cameras), crops, self._cameras, windowed=True
-            )
+            seen = project(self._kind, gaussians, views, sh_degree, antialiased)
+            drawing = Drawing.of(self._kind, FlatSplats.of(seen), crops, windowed=True)
             kept_ids = drawing.kept_ids(drawing.inside([shot.inside for shot in few]))
             fronts, backs = [shot.front for shot in few], [shot.back for shot in few]
             layers = (drawing.windowed(windows).layers() for windows in (fronts, backs))
@@ -121,16 +118,9 @@ class GsplatRasterizer(Rasterizer):
         """See Rasterizer.depth_windows."""
         for few in _a_few(seen, seen, gaussians):
             views, crops = zip(*few, strict=True)
-            projected = self._seen(gaussians, views, 0, antialiased)
-            drawing = Drawing.of(self._kind, FlatSplats.of(projected, self._cameras), crops, self._cameras)
+            projected = project(self._kind, gaussians, views, 0, antialiased)
+            drawing = Drawing.of(self._kind, FlatSplats.of(projected), crops)
             yield from drawing.windows(visible)
-
-    def _seen(
-        self, gaussians: Gaussians, views: Sequence[View], sh_degree: int, antialiased: bool
-    ) -> Projected:
-        if len(gaussians) == 0:
-            return Projected.nothing(len(views), self.primitive.rows, gaussians.means)
-        return project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased)
 
     def _draw_alike(
         self,
@@ -145,17 +135,18 @@ class GsplatRasterizer(Rasterizer):
         frozen = [
             (k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen is not None and len(shot.frozen)
         ]
-        if len(gaussians) == 0 and not frozen:
-            return _nothing(gaussians, shots)
-        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased, blend_weights)
-        everyone = FlatSplats.of(own, self._cameras, frozen, blend_weights)
+        own = project(self._kind, gaussians, views, sh_degree, antialiased, blend_weights)
+        info = _info(own, views[0]) | ({"weights": own.weights} if blend_weights else {})
+        if len(gaussians) == 0 and not frozen:  # gsplat is not asked
+            colors = [own.centers.sum().expand(crop.height, crop.width, 3) for crop in crops]
+            return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]
+        everyone = FlatSplats.of(own, frozen, blend_weights)
         windows = [shot.z_window for shot in shots]
         windowed = any(window is not None for window in windows)
-        drawing = Drawing.of(self._kind, everyone, crops, self._cameras, windowed=windowed)
+        drawing = Drawing.of(self._kind, everyone, crops, windowed=windowed)
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
-        info = _info(own, views[0]) | ({"weights": own.weights} if blend_weights else {})
         if judge:
             info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
         sheet = drawing.rasterized()
@@ -165,10 +156,16 @@ class GsplatRasterizer(Rasterizer):
 def _a_few(
     items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
 ) -> Iterator[list[Item]]:
-    kinds = [(view.width, view.height, view.near) for view, _ in seen]
-    crops = [crop for _, crop in seen]
-    limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS}
-    return runs(items, crops, DEVICE_PIXELS, **limits, kinds=kinds, padded=True)
+    limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS, "padded": True}
+    pairs = zip(items, seen, strict=True)
+    for _, alike in groupby(pairs, lambda pair: _size(pair[1][0])):
+        own, seen_by = zip(*alike, strict=True)
+        yield from runs(own, [crop for _, crop in seen_by], DEVICE_PIXELS, **limits)
+
+
+def _size(view: View) -> tuple[int, int, float]:
+    """What views have in common that gsplat draws in one call."""
+    return view.width, view.height, view.near
 
 
 def _alike(kinds: Sequence[object]) -> list[list[int]]:
@@ -184,17 +181,3 @@ def _info(own: Projected, view: View) -> dict[str, Any]:
         "height": view.height,
         "gaussian_ids": None,
     }
-
-
-def _nothing(gaussians: Gaussians, shots: Sequence[Shot]) -> list[Raster]:
-    """Empty drawings; gsplat is not asked. In the graph like any other, so that a loss has a gradient."""
-    means, opacities = (
-        gaussians.means.expand(len(shots), -1, -1),
-        gaussians.opacities[:, 0].expand(len(shots), -1),
-    )
-    features = means.new_zeros((len(shots), 0, 4))
-    centers = means[..., :2]
-    empty = Projected(opacities.int(), centers, opacities, means, opacities, features, centers, opacities)
-    zero, info = empty.centers.sum(), _info(empty, shots[0].view)
-    colors = [zero.expand(shot.crop.height, shot.crop.width, 3) for shot in shots]
-    return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]

@@ -13,7 +13,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.cuda.frame import Shown
+from abcd_ns.engine.render.base import Shown
 
 BLOCK = 256
 VALUES = (

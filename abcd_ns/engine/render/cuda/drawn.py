@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from abcd_ns.engine.render.base import Raster
+from abcd_ns.engine.render.base import Frame, Raster, Shown
 from abcd_ns.engine.render.cuda import fused
-from abcd_ns.engine.render.cuda.frame import Frame, Shown
 
 
 class Drawn(Raster):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind
-from abcd_ns.engine.render.cuda.projection import Cameras, Projected
+from abcd_ns.engine.render.cuda.projection import Projected, corners, numbers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.residual_sums import SUMS, about, moments
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -47,10 +47,7 @@ class FlatSplats:
 
     @staticmethod
     def of(
-        own: Projected,
-        cameras: Cameras,
-        frozen: Sequence[tuple[int, Splats]] = (),
-        blend_weights: bool = False,
+        own: Projected, frozen: Sequence[tuple[int, Splats]] = (), blend_weights: bool = False
     ) -> "FlatSplats":
         """Camera by camera; then what is frozen, as (camera, what it sees) pairs.
 
@@ -58,12 +55,12 @@ class FlatSplats:
             blend_weights: as `own` was projected, with zeros for the depths that are composited.
         """
         count, n = own.radii.shape
-        numbers = cameras.numbers(count, n, own.radii.device)
+        cameras = numbers(count, n, own.radii.device)
         names = ("radii", "means2d", "depths", "shapes", "opacities", "features")
         values = [getattr(own, name).flatten(0, 1) for name in names]
         if not frozen:
-            return FlatSplats(numbers, *values)
-        firsts = numbers.view(count, n)[:, :1] if n else torch.arange(count, device=numbers.device)[:, None]
+            return FlatSplats(cameras, *values)
+        firsts = cameras.view(count, n)[:, :1] if n else torch.arange(count, device=cameras.device)[:, None]
         each = Splats(torch.cat([splats.planes for _, splats in frozen], dim=1))
         last = (
             F.pad(each.colors, (0, 1))
@@ -73,7 +70,7 @@ class FlatSplats:
         theirs = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, last)
         frozen_cameras = [firsts[camera].expand(len(splats)) for camera, splats in frozen]
         pairs = zip(values, theirs, strict=True)
-        return FlatSplats(torch.cat((numbers, *frozen_cameras)), *(torch.cat(pair) for pair in pairs))
+        return FlatSplats(torch.cat((cameras, *frozen_cameras)), *(torch.cat(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
@@ -181,9 +178,7 @@ class Drawing:
     """Whose they are."""
 
     @staticmethod
-    def of(
-        kind: Kind, splats: FlatSplats, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False
-    ) -> "Drawing":
+    def of(kind: Kind, splats: FlatSplats, crops: Sequence[Crop], *, windowed: bool = False) -> "Drawing":
         """What may be drawn in a crop of each camera.
 
         Args:
@@ -191,9 +186,9 @@ class Drawing:
         """
         layout = TileLayout(tuple(crops), windowed)
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
-        corners = cameras.corners(layout.tiled, splats.means2d)
-        corners = corners if len(crops) == 1 else corners.index_select(0, splats.cameras)
-        means2d, shapes = splats.means2d - corners, kind.moved(splats.shapes, corners)
+        by = corners(layout.tiled, splats.means2d)
+        by = by if len(crops) == 1 else by.index_select(0, splats.cameras)
+        means2d, shapes = splats.means2d - by, kind.moved(splats.shapes, by)
         if len(splats) == 0:
             return Drawing(kind, splats, means2d, shapes, layout, splats.cameras, splats.cameras.int())
         _, rows, cols = layout.shape

@@ -1,8 +1,8 @@
 """Gaussians as several cameras see them, in gsplat's shapes, and these cameras on the device."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -16,80 +16,50 @@ from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Crop, Gaussians, View
 
-MOST_KEPT = 1 << 14
-"""Small tensors that are kept on the device; then all are forgotten."""
+KEPT = 1 << 14
+"""Small tensors of a kind that are kept on the device: steps would otherwise upload them again and again."""
 
 
-class Kept:
-    """Small tensors on the device that steps would otherwise upload again and again."""
-
-    def __init__(self) -> None:
-        self._held: dict[Hashable, Tensor] = {}
-
-    def get(self, keys: Sequence[Hashable], make: Callable[[list[int]], Sequence[Tensor]]) -> list[Tensor]:
-        """A tensor for each key; `make` is asked once for all places whose key is new."""
-        new = [k for k, key in enumerate(keys) if key not in self._held]
-        if new:
-            if len(self._held) + len(new) > MOST_KEPT:
-                self._held.clear()
-                new = list(range(len(keys)))
-            with torch.inference_mode(False), torch.no_grad():  # they outlive this call
-                self._held.update(zip((keys[k] for k in new), make(new), strict=True))
-        return [self._held[key] for key in keys]
+def poses(
+    views: Sequence[View], like: Tensor
+) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"], Float[Tensor, "c 3"]]:
+    """World to camera, intrinsics, and centres in world space. Those that take gradients are not kept."""
+    if any(view.viewmat.requires_grad for view in views):
+        packed = torch.stack([_packed(view) for view in views]).to(like)
+    else:
+        packed = _stacked([_kept_pose(view, like.device, like.dtype) for view in views])
+    return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
 
 
-class Cameras:
-    """Matrices of views, which are on the CPU, and corners of crops, on the device."""
-
-    def __init__(self) -> None:
-        self._views: dict[tuple[int, int], View] = {}
-        self._poses, self._corners = Kept(), Kept()
-        self._numbers: tuple[Any, Tensor] | None = None
-
-    def numbers(self, cameras: int, n: int, device: torch.device) -> Int64[Tensor, "m"]:
-        """0 to `cameras` less 1, n times each; the last are kept."""
-        key = cameras, n, device
-        if self._numbers is None or self._numbers[0] != key:
-            with torch.inference_mode(False):  # they outlive this call
-                each = torch.arange(cameras, device=device)[:, None].expand(-1, n)
-                self._numbers = key, each.reshape(-1).contiguous()
-        return self._numbers[1]
-
-    def poses(
-        self, views: Sequence[View], like: Tensor
-    ) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"], Float[Tensor, "c 3"]]:
-        """World to camera, intrinsics, and centres in world space; all new ones in one copy. Those that take
-        gradients are not kept."""
-        place = like.device, like.dtype
-        if len(self._views) > MOST_KEPT:
-            self._views, self._poses = {}, Kept()
-        if any(view.viewmat.requires_grad for view in views):
-            packed = _rows(views).to(like)
-        else:
-            keys = [(id(view.viewmat), id(view.K), *place) for view in views]
-            packed = _stacked(self._poses.get(keys, partial(self._new_poses, views, like)))
-        return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
-
-    def corners(self, crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
-        """(x, y) of upper left corners; written there by the device, so nothing is copied."""
-        keys = [(crop.x, crop.y, like.device, like.dtype) for crop in crops]
-        return _stacked(self._corners.get(keys, partial(_new_corners, crops, like)))
-
-    def _new_poses(self, views: Sequence[View], like: Tensor, new: list[int]) -> Sequence[Tensor]:
-        for k in new:  # holds on to tensors by whose identity views are known
-            self._views[id(views[k].viewmat), id(views[k].K)] = views[k]
-        return _rows([views[k] for k in new]).to(like, non_blocking=True).unbind()
+def corners(crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
+    """(x, y) of upper left corners; written there by the device, so nothing is copied."""
+    return _stacked([_kept_corner(crop.x, crop.y, like.device, like.dtype) for crop in crops])
 
 
-def _new_corners(crops: Sequence[Crop], like: Tensor, new: list[int]) -> Sequence[Tensor]:
-    place = {"dtype": like.dtype, "device": like.device}
-    pairs = ((crops[k].x, crops[k].y) for k in new)
-    return [torch.stack([torch.full((), x, **place) for x in pair]) for pair in pairs]
+@lru_cache(maxsize=1)
+def numbers(cameras: int, n: int, device: torch.device) -> Int64[Tensor, "m"]:
+    """0 to `cameras` less 1, n times each; the last are kept."""
+    with torch.inference_mode(False):  # they outlive this call
+        each = torch.arange(cameras, device=device)[:, None].expand(-1, n)
+        return each.reshape(-1).contiguous()
 
 
-def _rows(views: Sequence[View]) -> Float[Tensor, "c 28"]:
-    """Both matrices of each view, and its centre."""
-    return torch.stack([torch.cat((v.viewmat.flatten(), v.K.flatten(), v.center)) for v in views])
+def _packed(view: View) -> Float[Tensor, "28"]:
+    """Both matrices of a view, and its centre."""
+    return torch.cat((view.viewmat.flatten(), view.K.flatten(), view.center))
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_pose(view: View, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "28"]:
+    """Views are known by the identity of their matrices."""
+    with torch.inference_mode(False), torch.no_grad():  # they outlive this call
+        return _packed(view).to(device, dtype, non_blocking=True)
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_corner(x: int, y: int, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "2"]:
+    with torch.inference_mode(False), torch.no_grad():  # they outlive this call
+        return torch.stack([torch.full((), at, device=device, dtype=dtype) for at in (x, y)])
 
 
 @dataclass(frozen=True)
@@ -111,10 +81,12 @@ class Projected:
     """What gets the gradient of the depths that are composited."""
 
     @staticmethod
-    def nothing(cameras: int, rows: int, like: Tensor) -> "Projected":
-        """No Gaussian, of which Splats would have so many rows."""
-        centers, features, shapes = (like.new_zeros((cameras, 0, k)) for k in (2, 4, rows - 11))
-        depths = features[..., 3]
+    def nothing(cameras: int, shape: int, gaussians: Gaussians) -> "Projected":
+        """No Gaussian, of whose shape there would be so many numbers. In the graph like any other, so that a
+        loss has a gradient."""
+        centers = gaussians.means[:, :2].expand(cameras, -1, -1)
+        features, shapes = (centers.new_zeros((cameras, 0, k)) for k in (4, shape))
+        depths = centers[..., 0]
         return Projected(depths.int(), centers, depths, shapes, depths, features, centers, depths)
 
     def splats(self, camera: int, which: Int[Tensor, "k"] | None = None) -> Splats:
@@ -130,10 +102,10 @@ class Projected:
 
 
 def place_on_screen(
-    kind: Kind, gaussians: Gaussians, views: Sequence[View], cameras: Cameras, antialiased: bool = False
+    kind: Kind, gaussians: Gaussians, views: Sequence[View], antialiased: bool = False
 ) -> tuple[OnScreen, Float[Tensor, "c 3"]]:
     """Where views see Gaussians, and the views' centres in world space."""
-    *matrices, centers = cameras.poses(views, gaussians.means)
+    *matrices, centers = poses(views, gaussians.means)
     return kind.place(gaussians, tuple(matrices), views[0], antialiased), centers
 
 
@@ -141,7 +113,6 @@ def project(
     kind: Kind,
     gaussians: Gaussians,
     views: Sequence[View],
-    cameras: Cameras,
     sh_degree: int,
     antialiased: bool,
     blend_weights: bool = False,
@@ -152,7 +123,9 @@ def project(
         views: of one size and near plane.
         blend_weights: give zeros for the depths that are composited.
     """
-    placed, eyes = place_on_screen(kind, gaussians, views, cameras, antialiased)
+    if len(gaussians) == 0:  # of which gsplat's kernels are not asked
+        return Projected.nothing(len(views), kind.shape, gaussians)
+    placed, eyes = place_on_screen(kind, gaussians, views, antialiased)
     radii, means2d, depths, shapes, centers, compensations = placed
     opacities = gaussians.opacities.flatten().sigmoid()
     opacities = opacities[None] if len(views) == 1 else opacities.expand(len(views), -1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
-from abcd_ns.engine.render.cuda.frame import Frame
+from abcd_ns.engine.render.base import Frame
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
