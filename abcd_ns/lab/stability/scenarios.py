@@ -13,7 +13,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import Event, VisitEnded
 from abcd_ns.engine.gaussians.initialize import random_points
-from abcd_ns.engine.layers.fog import fog_in_white
+from abcd_ns.engine.layers.surface import fog_in_white
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.density.control import DensityConfig
