@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
@@ -182,8 +183,12 @@ def test_no_client_writes_a_file_outside_the_folder_of_camera_paths(server, brow
     assert victim.read_text() == "the run"
     set_to("Render name", "tour")
     set_to("Generate Command", True)
-    assert answers()
-    assert (tmp_path / "data/camera_paths/tour.json").exists()
+    tour = tmp_path / "data/camera_paths/tour.json"
+    for _ in range(200):  # written after the server has answered
+        if answers() and tour.exists():
+            break
+        time.sleep(0.1)
+    assert tour.exists()
 
 
 def test_another_viser_is_not_guarded_and_the_user_told(monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """gsplat 1.4.0's `rasterization` on any device: this package's rasterizers behind gsplat's signature."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -87,12 +88,7 @@ def rasterization(
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
     shots = [Shot(view, view.full) for view in views]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
-    rasterizer = rasterizer_on(means.device)
-    if absgrad:
-        if not isinstance(rasterizer, TorchRasterizer):
-            raise ValueError(NO_ABSGRAD)
-        options["absgrad"] = True
-    rasters = rasterizer.draw(gaussians, shots, **options)
+    rasters = _draw(gaussians, shots, absgrad, **options)
     color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]
@@ -100,6 +96,15 @@ def rasterization(
         depth = depth / alphas.clamp_min(1e-10)
     wanted = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode)
     return torch.cat(wanted, dim=-1), alphas, rasters[0].info
+
+
+def _draw(gaussians: Gaussians, shots: Sequence[Shot], absgrad: bool, **options: Any) -> tuple[Raster, ...]:
+    rasterizer = rasterizer_on(gaussians.means.device)
+    if not absgrad:
+        return rasterizer.draw(gaussians, shots, **options)
+    if not isinstance(rasterizer, TorchRasterizer):
+        raise ValueError(NO_ABSGRAD)
+    return rasterizer.draw(gaussians, shots, absgrad=True, **options)
 
 
 def _channels(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
