@@ -204,9 +204,10 @@ def _budgets_plan(given: Options, asked: Options) -> Plan:
     if others := set(given.methods) - {*WITHIN, *ALONE}:
         raise UserError(f"{min(others)} keeps to no budget: leave it out.")
     settings = dataclasses.replace(_settings(given), blocks=0)
+    command = _command(dataclasses.replace(given, blocks=None, prices=None, vary=None, max_gaussians=None))
     methods = [m for m in METHODS if m == JOINT or (m in ALONE and m in given.methods)]
     jobs = tuple(Job(method, seed, settings) for seed in given.seeds for method in methods)
-    return Plan("comparison", settings, Path(given.out), jobs, _command(given))
+    return Plan("comparison", settings, Path(given.out), jobs, command)
 
 
 def _terrain_plan(given: Options) -> Plan:

@@ -82,3 +82,9 @@ def test_a_budget_that_is_no_share_is_refused(options, share):
 def test_what_contradicts_budgets_is_refused_by_name(options, other):
     with pytest.raises(UserError, match=f"--{min(other).replace('_', '-')} does not go with --budgets"):
         make_plan(Options(**{**vars(options), **other}))
+
+
+def test_the_command_that_is_written_makes_the_same(options):
+    plan = make_plan(options)
+    assert "--budgets 1/4 1/2" in plan.command
+    assert not {"--blocks", "--max-gaussians"} & set(plan.command.split())
