@@ -87,6 +87,8 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     if not settings.densify:
         pipeline.training.density.strategy = "off"
     change_options(pipeline, job.changes)
+    if pipeline.gaussian_bytes:
+        pipeline.workers = 1  # the budget is one device's
     if pipeline.gaussian_bytes and job.method == "abcd-monolithic":
         needs = DeviceNeeds(0, views_per_step(pipeline.training.batch, 1), pipeline.training.sh_degree)
         pipeline.training.density.max_gaussians = pipeline.gaussian_bytes // needs.gaussian_bytes

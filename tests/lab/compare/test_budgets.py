@@ -63,6 +63,7 @@ def test_joint_training_has_as_many_gaussians_as_fit_and_blocks_choose_for_thems
     assert joint.training.density.max_gaussians == share // DeviceNeeds(0, 1).gaussian_bytes
     blocks = configs[f"abcd, gaussian_bytes={share}, seed 0"]
     assert (blocks.blocks, blocks.gaussian_bytes, blocks.training.density.max_gaussians) == (0, share, 0)
+    assert blocks.workers == 1  # one device
 
 
 def test_the_chart_has_quality_over_measured_memory(results, tmp_path, drawn):
