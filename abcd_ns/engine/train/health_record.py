@@ -21,7 +21,8 @@ class BlockHealth:
     moments: int = 0
     """Rows of Adam's moments likewise."""
     values: int = 0
-    """Gaussians that were no numbers and were replaced by transparent ones."""
+    """Gaussians that were no numbers: put back as they were at rest or, where that is not known, replaced by
+    transparent ones."""
     giants: int = 0
     """Gaussians that were shrunk."""
     shed: int = 0

@@ -61,7 +61,7 @@ class TrainingRun:
             self.light = Light(config.light, list(self.views), self.device)
         self.poses = Poses(views)
         may_act = config.recipe.heal and config.recipe.layers
-        self.health = Health(params, optimizers, self.announce, may_act=may_act)
+        self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.density = DensityControl(config.density, rasterizer.primitive)
 
     def views_at(self, reduction: int) -> dict[int, View]:

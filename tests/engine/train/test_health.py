@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import Repaired
+from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
@@ -62,28 +62,39 @@ def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(make, photos,
         assert all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
 
 
-def test_a_gaussian_that_is_no_number_becomes_transparent_and_a_moment_zero(make, photos):
+def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, photos):
     coordinator = make(blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
-    told = listen(coordinator, Repaired)
+    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Repaired)
     with torch.no_grad():
-        coordinator.params["means"][4, 1], coordinator.params["scales"][3] = math.nan, 100.0
+        coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
     squares = coordinator.optimizers["quats"].state[coordinator.params["quats"]]["exp_avg_sq"]
     kept = squares[1].clone()
     squares[0] = math.inf
     coordinator.save()
     repaired = sorted((event.what, event.count, event.block) for event in told)
-    assert repaired == [("moments", 1, block), ("values", 2, block)]
+    assert repaired == [("moments", 1, block), ("values", 1, block)]
     assert bool((squares[0] == 0).all())
     assert torch.equal(squares[1], kept)
     live = coordinator.scene.gaussians(block)
-    assert all(bool(torch.isfinite(value).all()) for _, value in live.items())
-    assert float(torch.sigmoid(live.opacities[[3, 4]]).max()) < 1 / 255
+    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in live.items())
     moments = coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"]
     assert bool((moments[4] == 0).all())
     assert bool((moments[5] != 0).any())
+
+
+def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos):
+    coordinator = make(blocks=2, steps=200, density=GROWING)
+    attached = listen(coordinator, VisitBegan)
+    while not attached or len(coordinator.params["means"]) == attached[-1].gaussians:
+        train_step(coordinator, photos)
+    with torch.no_grad():
+        coordinator.params["scales"][0] = 100.0
+    coordinator.save()
+    assert bool(torch.isfinite(coordinator.params["scales"]).all())
+    assert float(torch.sigmoid(coordinator.params["opacities"].detach()[0])) < 1 / 255
 
 
 @pytest.mark.parametrize("blocks", [1, 2])

@@ -17,6 +17,8 @@ from abcd_ns.engine.events import Announcer, Repaired
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.render.loss import decibels
+from abcd_ns.engine.store.commit import state_for_visit
+from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health.health_rules import (
     HIDDEN,
@@ -29,7 +31,7 @@ from abcd_ns.engine.train.health.step_guard import StepGuard
 from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.transfer import StepNumbers
-from abcd_ns.engine.types import View
+from abcd_ns.engine.types import Gaussians, View
 
 LATE_AFTER = 16
 """Steps without a fault after which an accelerator's gradients are looked at a step late, without a wait."""
@@ -46,6 +48,7 @@ class Health:
 
     def __init__(
         self,
+        scene: VisitScene,
         params: Params,
         optimizers: Optimizers,
         announce: Announcer,
@@ -53,9 +56,11 @@ class Health:
         may_act: bool,
     ) -> None:
         self._may_act = may_act
-        self._params, self._optimizers, self._announce = params, optimizers, announce
+        self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
         self._active: ActiveVisit | None = None
         self._health_by_block: HealthByBlock = {}
+        self._attached: Tensor | None = None
+        self._resumed = False
         self._bad: Tensor | None = None
         self._shares: list[Tensor] = []
         self._numbers = StepNumbers(params["means"].device)
@@ -71,7 +76,8 @@ class Health:
             health_by_block: the run's, to be written to.
         """
         self._active, self._health_by_block = active, health_by_block
-        self._bad, self._shares = None, []
+        self._attached, self._bad, self._shares = self._params["means"], None, []
+        self._resumed = active.saved
         self._clean, self._psnr = LATE_AFTER, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
@@ -127,7 +133,7 @@ class Health:
         record.visits += 1
         if active.done:  # else time ran out before anybody could see
             record.hidden = not active.shown
-        self._active = None
+        self._active = self._attached = None
         return state
 
     def count(self, what: str, count: int) -> None:
@@ -181,10 +187,22 @@ class Health:
         rows = unsound(live).nonzero()[:, 0]
         if len(rows) == 0:
             return
-        for name, value in stand_ins(live[~unsound(live)], len(rows)).items():
-            self._params[name][rows] = value
+        sound = self._known(live, rows)
+        for name, value in live.items():
+            value[rows] = getattr(sound, name).to(value)
             self._forget_moments(name, rows)
         self.count("values", len(rows))
+
+    def _known(self, live: Gaussians, rows: Tensor) -> Gaussians:
+        """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
+        active = self._active
+        if active is not None and self._params["means"] is self._attached:
+            before = state_for_visit(self._scene, active.geometry.block, self._resumed).gaussians
+            if len(before) == len(live):
+                kept = before[rows.cpu()]
+                if not bool(unsound(kept).any()):
+                    return kept
+        return stand_ins(live[~unsound(live)], len(rows))
 
     def _forget_moments(self, name: str, rows: Tensor) -> None:
         adam = self._optimizers[name].state[self._params[name]]
