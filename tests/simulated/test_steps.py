@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import Repaired, StepTaken
+from abcd_ns.engine.gaussians import param_swap
 from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -89,6 +90,19 @@ def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, 
     before = counts.copy()
     lowered(gaussians, growth, ring)
     assert counts.since(before).copies_to_device == 1
+
+
+def test_no_more_ram_is_pinned_for_a_block_than_there_is_for_that(counts, monkeypatch):
+    """Four of 4,000 bytes take 4,096 each, and the last is always waited for."""
+    values = [torch.full((1000,), float(k), device=DEVICE) for k in range(4)]
+    waits = []
+    for room in (0, 8192, 1 << 20):
+        monkeypatch.setattr(param_swap, "PINNED_BYTES", room)
+        before = counts.copy()
+        copies = param_swap._on_cpu(values)
+        waits.append(counts.since(before).waited)
+        assert all(bool((copy == k).all()) for k, copy in enumerate(copies))
+    assert waits == [4, 2, 1]
 
 
 def test_numbers_of_a_step_are_there_a_step_later(counts):

@@ -87,6 +87,12 @@ class BlockState:
         """On another device."""
         return self._each(lambda part: part.to(device))
 
+    def unpinned(self) -> "BlockState":
+        """Out of pinned memory, into which a GPU copies."""
+        if not self.gaussians.means.is_pinned():
+            return self
+        return self[torch.arange(len(self))]
+
     def packed(self) -> Packed:
         """As it is kept, for the store; clocks as JSON."""
         parts = {"": self.gaussians, **{f"{moment}.": getattr(self, moment) for moment in MOMENTS}}

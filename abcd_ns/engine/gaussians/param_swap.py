@@ -30,6 +30,8 @@ RATED_FOR = 10_000
 UNDER_TRAINED_RATES = 4.0
 """Times as large they are before, at most; a step of four views is as large as that by itself."""
 
+PINNED_BYTES = 256 << 20
+"""Of RAM that is pinned to copy a block from a GPU, at most: torch gives none of it back."""
 STEP_PARTS = 128
 """Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
 
@@ -58,18 +60,30 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
 def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
     """The live block as a BlockState on the CPU that shares no memory with later steps; it stays live.
 
+    From a GPU up to PINNED_BYTES of the copies are in pinned memory, which is not for keeping: what is put to
+    rest is copied once more.
+
     Args:
         growth: the strategy's statistics, each [n]; copied.
         clocks: the block's clocks, up to date.
     """
     adam = {name: optimizers[name].state[params[name]] for name in PARAM_NAMES}
-    values = [params, *({name: adam[name][moment] for name in PARAM_NAMES} for moment in MOMENTS)]
-    parts = [Gaussians(**{name: _on_cpu(each[name]) for name in PARAM_NAMES}) for each in values]
-    return BlockState(*parts, {name: _on_cpu(value) for name, value in growth.items()}, clocks)
+    moments = [adam[name][moment] for moment in MOMENTS for name in PARAM_NAMES]
+    copies = iter(_on_cpu([*(params[name] for name in PARAM_NAMES), *moments, *growth.values()]))
+    parts = [Gaussians(**{name: next(copies) for name in PARAM_NAMES}) for _ in ("", *MOMENTS)]
+    return BlockState(*parts, {name: next(copies) for name in growth}, clocks)
 
 
-def _on_cpu(value: Tensor) -> Tensor:
-    return value.detach().to("cpu", copy=True)
+def _on_cpu(values: list[Tensor]) -> list[Tensor]:
+    """Copies of tensors of one device. Those in pinned RAM are waited for once: the last comes when all have.
+    The others, for which PINNED_BYTES do not suffice, are waited for one by one."""
+    copies, room = [], PINNED_BYTES
+    for k, value in enumerate(values):
+        pinned = 1 << (value.nbytes - 1).bit_length() if value.nbytes else 0  # torch rounds up so
+        is_late = k + 1 < len(values) and pinned <= room
+        room -= pinned if is_late else 0
+        copies.append(value.detach().to("cpu", copy=True, non_blocking=is_late))
+    return copies
 
 
 def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:

@@ -178,7 +178,7 @@ class Coordinator(Trainer):
         if (active := self.state.active) is not None:
             self.health.look_over()
             self.scene.make_room()
-            updates = {LIVE: self.visit.live.detached()}
+            updates = {LIVE: self.visit.live.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()

@@ -10,6 +10,7 @@ import torch
 
 from abcd_ns import rasterization
 from abcd_ns.engine.kernels.native import library
+from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.render.rasterization import FIXED
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
@@ -144,3 +145,20 @@ def test_absolute_gradients_are_sums_over_pixels():
         expected += one["means2d"].grad.abs()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
     assert (found > meta["means2d"].grad.abs() - 1e-4).all()
+
+
+def test_surfels_have_no_absolute_gradients():
+    gaussians, view = random_gaussians(3).to(torch.float32), small_view(19, 11, torch.float32)
+    with pytest.raises(ValueError, match="absgrad=True is not supported here"):
+        TorchRasterizer(primitive="2dgs").draw(gaussians, [Shot(view, view.full)], sh_degree=0, absgrad=True)
+
+
+def test_what_is_frozen_in_another_precision_is_drawn_as_what_it_is():
+    gaussians, view = random_gaussians(6).to(torch.float32), small_view(19, 11, torch.float32)
+    frozen = random_gaussians(5, seed=3)
+    draws, pictures = TorchRasterizer(), []
+    for dtype in (torch.float32, torch.float64):
+        seen = draws.project(frozen.to(dtype), view.to(dtype))
+        (raster,) = draws.draw(gaussians, [Shot(view, view.full, seen)], sh_degree=0)
+        pictures.append(raster.color.float())
+    torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-4)

@@ -371,8 +371,8 @@ struct Batch {
         Shape::add(r, dx[px], dy[py], s[l], found);
         for (int c = 0; c < 4; c++) found[Shape::COLORS + c] += w[l] * up[c][p];
         V* more = found + Shape::SUMS;
-        if (EXTRA == ABSOLUTE) Shape::add_absolute(r, dx[px], dy[py], s[l], more);
-        if (EXTRA == GROWTH) {
+        if constexpr (EXTRA == ABSOLUTE) Shape::add_absolute(r, dx[px], dy[py], s[l], more);
+        if constexpr (EXTRA == GROWTH) {
           more[0] += w[l] * residual[CHANNELS][p];
           for (int c = 0; c < CHANNELS; c++) {
             const V asks = w[l] * residual[c][p];

@@ -143,8 +143,6 @@ struct Surfel {
     return alpha_of(splat(0) + r[12], LOG2_E * vmin(on_disc, ex * ex + ey * ey), meets);
   }
 
-  static void add_absolute(const V*, V, V, V, V*) {}  // gsplat has none of surfels here
-
   static void add(const V* r, V dx, V dy, V g, V* sums) {
     V s, t, inverse;
     I meets;

@@ -23,7 +23,7 @@ PIXELS_AT_ONCE, SPLATS_AT_ONCE = 1 << 17, 200_000
 than what they compute."""
 
 
-NO_ABSGRAD = "absgrad=True is not supported here: it takes float32 on a CPU and a C++ compiler."
+NO_ABSGRAD = "absgrad=True is not supported here: it takes 3dgs in float32 on a CPU, and a C++ compiler."
 
 
 class TorchRasterizer(Rasterizer):
@@ -91,7 +91,7 @@ class TorchRasterizer(Rasterizer):
         crops, windows = [shot.crop for shot in shots], [shot.z_window for shot in shots]
         lists = self._lists(gaussians, parts, crops, windows, blend_weights)
         if absgrad:
-            if not isinstance(lists, native.Lists):
+            if not isinstance(lists, native.Lists) or self.primitive.name != "3dgs":
                 raise ValueError(NO_ABSGRAD)
             lists.absolute = means2d
         pictures, sums = lists.composite(planes, means2d, weights)
@@ -153,9 +153,9 @@ class TorchRasterizer(Rasterizer):
         self._lists(gaussians, _each_a_picture(planes), [view.full]).deepen([window], *state)
         return state[0].abs(), state[1]
 
-    def _suits(self, gaussians: Gaussians) -> bool:
+    def _suits(self, gaussians: Gaussians, *planes: Tensor) -> bool:
         known = gaussians.features_rest.shape[1] in native.COEFFICIENTS
-        return self._use_native and known and suits(gaussians.means)
+        return self._use_native and known and suits(gaussians.means, *planes)
 
     def _project(
         self, gaussians: Gaussians, views: Sequence[View], sh_degree: int, antialiased: bool
@@ -175,7 +175,7 @@ class TorchRasterizer(Rasterizer):
         windows: native.Windows = (),
         wants_weights: bool = False,
     ) -> native.Lists | reference.Lists:
-        if self._suits(gaussians):
+        if self._suits(gaussians, *(part.planes for part in parts)):
             return native.Lists(parts, crops, self.primitive, windows, wants_weights)
         return reference.find_lists(parts, crops, self.primitive, windows, self.tile_side)
 
