@@ -89,3 +89,8 @@ def test_help_shows_how_to_use_it(words, told, capsys):
     assert cli.main(["train", *words]) == 0
     assert "abcd train small-gpu" in capsys.readouterr().out
     assert not told
+
+
+def test_an_absent_file_is_refused(tmp_path, told):
+    assert cli.main(["train", str(tmp_path / "absent.toml")]) == 2
+    assert not told

@@ -1,10 +1,12 @@
 """Scenes as users have them: cameras, points and photos are read right."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from hypothesis import given, settings
@@ -25,6 +27,9 @@ from tests.data.dataparser_scenes import (
     write_photos,
     write_transforms,
 )
+
+REAL = Path(os.environ.get("ABCD_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
+"""Where the real scenes are, if they are."""
 
 
 @pytest.mark.parametrize("offset", [0.0, 5e6])
@@ -254,3 +259,24 @@ def test_masks_of_all_frames_reach_the_dataset(scene):
     assert data["mask"].dtype == torch.bool
     assert not data["mask"][:, : width // 2].any()
     assert data["mask"][:, width // 2 :].all()
+
+
+@pytest.mark.parametrize("name", ["castle-P30", "fox"])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_real_scene_projects_as_pycolmap_does(name, factor):
+    if not (REAL / name).is_dir():
+        pytest.skip(f"{REAL / name} is not there; set ABCD_DATA to a folder that holds it")
+    model = pycolmap.Reconstruction(str(REAL / name / "sparse/0"))
+    outputs = parser(REAL / name, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
+    dataset = AbcdDataset(outputs)
+    for row in (0, 7):
+        image = model.find_image_with_name(outputs.image_filenames[row].name)
+        camera = model.camera(image.camera_id)
+        xyz = np.stack([point.xyz for _, point in sorted(model.points3D.items())])
+        local = image.cam_from_world() * xyz
+        front = local[:, 2] > 1e-3 * np.abs(local).max()
+        size = np.array([camera.width // factor, camera.height // factor])
+        expected = camera.img_from_cam(local[front]) * size / [camera.width, camera.height]
+        near = np.abs(expected).max(axis=1) < 4 * max(camera.width, camera.height)
+        assert np.abs(project(outputs, row)[front][near] - expected[near]).max() < 1e-2
+        assert dataset.get_numpy_image(row).shape == (*size[::-1], 3)

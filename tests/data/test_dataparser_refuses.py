@@ -287,3 +287,11 @@ def test_file_that_is_no_json_is_refused(scene, text):
     write_transforms(scene)
     (scene / "transforms.json").write_text(text)
     assert "not valid JSON" in refusal(scene)
+
+
+def test_all_bad_photos_are_listed_at_once(scene):
+    bad = [scene / "images" / name for name in NAMES[:3]]
+    for path in bad:
+        path.write_bytes(b"")
+    said = refusal(scene).splitlines()
+    assert sorted(said) == sorted(f"{path} is empty; copy the photo again." for path in bad)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.nerfstudio.inspection import inspect
@@ -204,3 +205,10 @@ def test_palette_becomes_its_colors(tmp_path):
     picture.save(tmp_path / "p.png")
     photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
     assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))
+
+
+def test_a_deep_mask_is_a_mask(scene):
+    mask = write_masks(scene)[0]
+    Image.fromarray(np.full(Image.open(mask).size[::-1], 40_000, np.uint16)).save(mask)
+    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
+    assert bool(AbcdDataset(outputs).photos.mask(0).all())

@@ -13,6 +13,7 @@ from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import lowered
 from abcd_ns.engine.train.density.pruning import BLEND_SUMS
+from abcd_ns.engine.train.health.health import LATE_AFTER
 from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
@@ -181,3 +182,18 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(make, photos):
     assert bool(coordinator.visit.live.growth["worth"].isfinite().all())
     train(coordinator, photos)
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
+
+
+def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(on_device, photos, simulated_gsplat):
+    """Rows are looked at one by one for a while, and steps that six optimizers count once are counted on."""
+    coordinator = on_device(blocks=1, steps=LATE_AFTER + 12, density=GATHERING)
+    spoil_once(coordinator, 3)
+    waits = []
+    for _ in range(LATE_AFTER + 10):
+        before = simulated_gsplat.copy()
+        train_step(coordinator, photos)
+        waits.append(simulated_gsplat.since(before).waited)
+    assert min(waits[5 : 4 + LATE_AFTER]) > 2
+    assert set(waits[-4:]) == {2}
+    steps = [o.state[coordinator.params[name]]["step"] for name, o in coordinator.optimizers.items()]
+    assert {float(step) for step in steps} == {LATE_AFTER + 9.0}

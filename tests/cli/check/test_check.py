@@ -156,3 +156,13 @@ def test_the_readers_notes_are_warnings(tmp_path):
     said = [finding.what for finding in examine(tmp_path).findings if finding.name == "input"]
     assert any("has no points" in line for line in said)
     assert any("Fewer than half have one" in line for line in said)
+
+
+def test_photos_that_are_all_missing_are_one_line(tmp_path, capsys):
+    many = [f"{i:02d}.png" for i in range(30)]
+    write_model(tmp_path / "sparse/0", names=many)
+    (tmp_path / "images").mkdir()
+    assert check(data=tmp_path) == 2
+    printed = capsys.readouterr().out
+    assert printed.count(".png") == 1
+    assert "29 others have the same fault" in printed
