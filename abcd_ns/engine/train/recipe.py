@@ -48,8 +48,8 @@ class Recipe:
     sh_ramp: float = 0.1
     """Share of the run over which the degree rises from 0 to the highest."""
     heal: bool = True
-    """Shrink oversized Gaussians where blocks are trained within layers. Non-finite values are repaired in
-    any case."""
+    """Shrink oversized Gaussians where blocks are trained within layers, and let none grow.
+    Non-finite values are repaired in any case."""
     means_lr_decay: float = 0.1
     """What the means' learning rate falls to over the run, exponentially, as a share. The final decay takes
     another tenth, which together is 3DGS's hundredth."""

@@ -159,7 +159,6 @@ class VisitTraining:
         self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.live.judge()
-            self.live.shrink_oversized()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
@@ -204,9 +203,7 @@ class VisitTraining:
         active = self.run.active
         if not active.is_all and not self.live.is_new:
             self.live.judge()
-        self.live.shrink_oversized()
-        if not active.is_whole:
-            self.live.count_visit()
+        self.live.end_visit(counts=not active.is_whole)
         state = self.run.health.end_visit(self.live.detached)
         self.layers = None
         return state

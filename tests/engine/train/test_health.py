@@ -14,6 +14,7 @@ from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room, live_bytes
+from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference import scenes
@@ -105,8 +106,9 @@ def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make
     with torch.no_grad():
         scales[0] = torch.tensor([5.0, -3.0, 5.0])
         means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
+        scales[2] = 5.0  # spared
     told, kept = listen(coordinator, Repaired), scales[2:].clone()
-    coordinator.health.shrink_oversized(views)
+    coordinator.health.shrink_oversized(views, torch.arange(len(scales)) == 2)
     assert [(event.what, event.count) for event in told] == [("giants", 1)]
     nearest = min(float((means[0] - view.center).norm()) for view in views)
     limit = health_rules.OVERSIZED_ANGLE * nearest
@@ -116,22 +118,40 @@ def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_oversized_gaussians_shrink_before_their_block_is_trained_and_never_after(
+def test_oversized_gaussians_shrink_before_their_block_is_trained_and_none_grows_later(
     make, views, photos, start, blocks
 ):
-    """A wall of one colour may be one oversized Gaussian: pictures without it were never seen."""
     start.scales[0] = 5.0
     coordinator = make(blocks=blocks, steps=20, warmup=0.0, density=STILL)
     told = listen(coordinator, Repaired)
-    train(coordinator, photos, steps=19)
+    train(coordinator, photos, steps=18)
     assert {event.what for event in told} == {"giants"}
-    scene = whole_scene(coordinator)
-    nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
-    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.OVERSIZED_ANGLE
+    told.clear()
     with torch.no_grad():
         coordinator.params["scales"][1] = 5.0
     train(coordinator, photos)
-    assert float(whole_scene(coordinator).scales.max()) == pytest.approx(5.0, abs=0.1)
+    scene = whole_scene(coordinator)
+    nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.OVERSIZED_ANGLE
+    assert not told
+    states = [coordinator.scene.state(block) for block in range(blocks)]
+    assert all(LARGEST not in state.growth for state in states)
+
+
+def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
+    """A wall of one colour may be one oversized Gaussian."""
+    coordinator = make(blocks=1, steps=40, warmup=0.0, density=STILL)
+    train(coordinator, photos, steps=12)
+    live = coordinator.visit.live
+    live.growth = {"weight": torch.zeros(len(live)), "passes": torch.ones(len(live))}
+    live.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
+    with torch.no_grad():
+        coordinator.params["scales"][:2] = 5.0
+    train_step(coordinator, photos)
+    with torch.no_grad():
+        coordinator.params["scales"][:2] = 6.0
+    train_step(coordinator, photos)
+    assert coordinator.params["scales"][:2].amax(dim=1).tolist() == pytest.approx([6.0, 5.0], abs=0.1)
 
 
 def test_stand_ins_are_numbers_even_among_none():

@@ -1,5 +1,6 @@
 // L1 and SSIM (Wang et al. 2004, as pytorch_msssim computes it) of pictures [h, w, 3], with their gradient.
 #pragma once
+#include <memory>
 #include <vector>
 
 #include "lanes.h"
@@ -20,12 +21,54 @@ struct Bell {
 static const Bell bell;
 
 // out[j] = sum over k of tap_k in[j + k step], j < count.
-static inline void slide(const float* in, int64_t step, int64_t count, float* out) {
+static inline void slide(const float* in, int64_t step, int64_t count, float* __restrict out) {
+  const Bell b = bell;
   for (int64_t j = 0; j < count; j++) {
     float total = 0;
-    for (int k = 0; k < TAPS; k++) total += bell.tap[k] * in[j + k * step];
+    for (int k = 0; k < TAPS; k++) total += b.tap[k] * in[j + k * step];
     out[j] = total;
   }
+}
+
+static inline float sum(const float* in, int64_t count) {
+  V sums{};
+  int64_t j = 0;
+  for (; j + LANES <= count; j += LANES) sums += load(in + j);
+  float total = 0;
+  for (int l = 0; l < LANES; l++) total += sums[l];
+  for (; j < count; j++) total += in[j];
+  return total;
+}
+
+// The same down the columns of x, y, x x, y y and x y, from one row on: [MOMENTS, row].
+static inline void blur_down(const float* x, const float* y, int64_t row, float* __restrict out) {
+  const Bell b = bell;
+#pragma GCC ivdep
+  for (int64_t j = 0; j < row; j++) {
+    float m_x = 0, m_y = 0, m_xx = 0, m_yy = 0, m_xy = 0;
+    for (int k = 0; k < TAPS; k++) {
+      const float p = x[j + k * row], q = y[j + k * row], tp = b.tap[k] * p, tq = b.tap[k] * q;
+      m_x += tp, m_y += tq, m_xx += tp * p, m_yy += tq * q, m_xy += tp * q;
+    }
+    out[j] = m_x, out[row + j] = m_y, out[2 * row + j] = m_xx, out[3 * row + j] = m_yy, out[4 * row + j] = m_xy;
+  }
+}
+
+// The sum of 1 - SSIM over windows of these moments [MOMENTS, count], and by[m wide + j]: its derivatives,
+// negative, by the means of x, x x and x y.
+static inline float dissimilarity(float* moments, int64_t count, int64_t wide, float* __restrict by) {
+#pragma GCC ivdep
+  for (int64_t j = 0; j < count; j++) {
+    const float mx = moments[j], my = moments[count + j];
+    const float a1 = 2 * mx * my + C1, a2 = 2 * (moments[4 * count + j] - mx * my) + C2;
+    const float b1 = mx * mx + my * my + C1;
+    const float b2 = (moments[2 * count + j] - mx * mx) + (moments[3 * count + j] - my * my) + C2;
+    const float per = 1 / (b1 * b2), similarity = a1 * a2 * per;
+    const float xy = 2 * a1 * per, xx = -similarity / b2;
+    by[j] = 2 * my * a2 * per - 2 * mx * similarity / b1 - my * xy - 2 * mx * xx;
+    by[wide + j] = xx, by[2 * wide + j] = xy, moments[j] = 1 - similarity;
+  }
+  return sum(moments, count);
 }
 }  // namespace photometric
 
@@ -34,66 +77,35 @@ extern "C" void abcd_photometric(const float* x, const float* y, int64_t h, int6
                                  double* sums, float* gradient) {
   using namespace photometric;
   const int64_t row = 3 * w, inner = 3 * (w - REACH), windows = h - REACH;
-  std::vector<float> rows(h * MOMENTS * inner), by(windows * 3 * inner), unlike(windows), apart(h);
-  parallel_ranges(h, 4, [&](int64_t begin, int64_t end) {
-    std::vector<float> products(3 * row);
-    for (int64_t r = begin; r < end; r++) {
-      const float *a = x + r * row, *b = y + r * row;
-      for (int64_t j = 0; j < row; j++) {
-        products[j] = a[j] * a[j], products[row + j] = b[j] * b[j], products[2 * row + j] = a[j] * b[j];
-      }
-      float* out = &rows[r * MOMENTS * inner];
-      slide(a, 3, inner, out), slide(b, 3, inner, out + inner);
-      for (int m = 0; m < 3; m++) slide(&products[m * row], 3, inner, out + (2 + m) * inner);
-    }
-  });
+  // Derivatives by what windows see of a row, in zeros: each pixel is in TAPS rows of windows.
+  std::unique_ptr<float[]> spread(new float[(h + REACH) * 3 * row]);
+  std::memset(&spread[0], 0, REACH * 3 * row * sizeof(float));
+  std::memset(&spread[h * 3 * row], 0, REACH * 3 * row * sizeof(float));
+  std::vector<float> unlike(windows), apart(h);
   parallel_ranges(windows, 4, [&](int64_t begin, int64_t end) {
-    std::vector<float> blurred(MOMENTS * inner);
+    const int64_t wide = inner + 6 * REACH;  // a window's derivatives, in zeros
+    std::vector<float> down(MOMENTS * row), moments(MOMENTS * inner), by(3 * wide);
     for (int64_t r = begin; r < end; r++) {
-      slide(&rows[r * MOMENTS * inner], MOMENTS * inner, MOMENTS * inner, blurred.data());
-      const float *m_x = blurred.data(), *m_y = m_x + inner, *m_xx = m_y + inner, *m_yy = m_xx + inner,
-                  *m_xy = m_yy + inner;
-      float *by_x = &by[r * 3 * inner], *by_xx = by_x + inner, *by_xy = by_xx + inner;
-      float total = 0;
-      for (int64_t j = 0; j < inner; j++) {
-        const float mx = m_x[j], my = m_y[j];
-        const float a1 = 2 * mx * my + C1, a2 = 2 * (m_xy[j] - mx * my) + C2;
-        const float b1 = mx * mx + my * my + C1, b2 = (m_xx[j] - mx * mx) + (m_yy[j] - my * my) + C2;
-        const float per = 1 / (b1 * b2), similarity = a1 * a2 * per;
-        const float xy = 2 * a1 * per, xx = -similarity / b2;
-        by_xy[j] = xy, by_xx[j] = xx;
-        by_x[j] = 2 * my * a2 * per - 2 * mx * similarity / b1 - my * xy - 2 * mx * xx;
-        blurred[j] = 1 - similarity;
-      }
-      for (int64_t j = 0; j < inner; j++) total += blurred[j];
-      unlike[r] = total;
+      blur_down(x + r * row, y + r * row, row, down.data());
+      for (int m = 0; m < MOMENTS; m++) slide(&down[m * row], 3, inner, &moments[m * inner]);
+      unlike[r] = dissimilarity(moments.data(), inner, wide, &by[3 * REACH]);
+      for (int m = 0; m < 3; m++) slide(&by[m * wide], 3, row, &spread[((r + REACH) * 3 + m) * row]);
     }
   });
   parallel_ranges(h, 4, [&](int64_t begin, int64_t end) {
-    // Columns first, into the middle of rows that are zero at both ends; then along rows.
-    const int64_t wide = inner + 6 * REACH;
-    std::vector<float> padded(3 * wide), spread(3 * row);
+    std::vector<float> by(3 * row);
     for (int64_t r = begin; r < end; r++) {
-      for (int m = 0; m < 3; m++) {
-        float* middle = &padded[m * wide + 3 * REACH];
-        std::memset(middle, 0, inner * sizeof(float));
-        for (int k = 0; k < TAPS; k++) {
-          if (r - k < 0 || r - k >= windows) continue;
-          const float* from = &by[((r - k) * 3 + m) * inner];
-          for (int64_t j = 0; j < inner; j++) middle[j] += bell.tap[k] * from[j];
-        }
-        slide(&padded[m * wide], 3, row, &spread[m * row]);  // the bell is symmetric
-      }
-      const float *a = x + r * row, *b = y + r * row, *s_x = spread.data(), *s_xx = s_x + row, *s_xy = s_xx + row;
-      float* out = gradient + r * row;
-      float total = 0;
+      slide(&spread[r * 3 * row], 3 * row, 3 * row, by.data());  // the bell is symmetric
+      const float *a = x + r * row, *b = y + r * row, *by_xx = &by[row], *by_xy = &by[2 * row];
+      float *by_x = by.data(), *out = gradient + r * row;
+#pragma GCC ivdep
       for (int64_t j = 0; j < row; j++) {
         const float difference = a[j] - b[j];
         const float sign = float(difference > 0) - float(difference < 0);
-        out[j] = weights[0] * sign - weights[1] * (s_x[j] + 2 * a[j] * s_xx[j] + b[j] * s_xy[j]);
+        out[j] = weights[0] * sign - weights[1] * (by_x[j] + 2 * a[j] * by_xx[j] + b[j] * by_xy[j]);
+        by_x[j] = std::fabs(difference);
       }
-      for (int64_t j = 0; j < row; j++) total += std::fabs(a[j] - b[j]);
-      apart[r] = total;
+      apart[r] = sum(by_x, row);
     }
   });
   sums[0] = sums[1] = 0;

@@ -212,7 +212,7 @@ class DensityControl:
             torch.manual_seed(clock.seed)
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
-                return {}
+                return {} if self.is_due(clock) else growth
             return self._step_default(params, optimizers, growth, clock)
 
     def prune(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.events import Announcer, Repaired
@@ -55,7 +55,7 @@ class Health:
         *,
         may_act: bool,
     ) -> None:
-        self._may_act = may_act
+        self.may_act = may_act
         self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
         self._active: ActiveVisit | None = None
         self._health_by_block: HealthByBlock = {}
@@ -105,22 +105,37 @@ class Health:
         return False, self._psnr
 
     @torch.no_grad()
-    def shrink_oversized(self, views: Iterable[View]) -> None:
+    def shrink_oversized(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> None:
         """Shrink Gaussians that are too large for every camera, along the axes that are.
 
         Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
         mean: from anywhere else it may come before what it lies behind, and veil half the picture.
+
+        Args:
+            spared: stay as they are.
         """
-        if not self._may_act:
+        if not self.may_act:
             return
         scales = self._params["scales"]
         over, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
+        over &= ~spared[:, None]
         rows = over.any(dim=1).nonzero()[:, 0]
         if len(rows) == 0:
             return
         scales[rows] = torch.where(over[rows], allowed[rows], scales[rows])
         self._forget_moments("scales", rows)
         self.count("giants", len(rows))
+
+    @torch.no_grad()
+    def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Logarithms of standard deviations that none may grow beyond, lest it be oversized.
+
+        Args:
+            spared: may grow as they like.
+        """
+        scales = self._params["scales"]
+        _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
+        return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed))
 
     def end_visit(self, detach: Callable[[], BlockState]) -> BlockState:
         """What the visit leaves behind: the live block, repaired.

@@ -4,6 +4,8 @@ import random
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
@@ -11,13 +13,18 @@ from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
-from abcd_ns.engine.train.density.pruning import LAST, faded
+from abcd_ns.engine.train.density.pruning import contributions, faded, have_contributions
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import Gaussians
+
+LARGEST = "largest"
+"""Name of a statistic, [n, 3]: see Health.largest. Only while a visit is under way."""
+FILLS = 0.01
+"""Share of a block's views: oversized Gaussians that fill more are no accident."""
 
 
 class ActiveBlock:
@@ -56,7 +63,8 @@ class ActiveBlock:
         if active.done == 0 and not (active.saved or active.is_whole or active.is_joint):
             self._lower_degrees()
         if active.done == 0 and not active.saved and self.clocks.visits == 0:
-            run.health.shrink_oversized(run.views.values())
+            run.health.shrink_oversized(run.views.values(), self._filling())
+        self._hold_sizes()
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
@@ -82,9 +90,10 @@ class ActiveBlock:
         clocks = self.clocks
         self.clocks = replace(clocks, adam_views=clocks.adam_views + views, steps=clocks.steps + taken)
 
-    def count_visit(self) -> None:
-        """A visit has ended."""
-        self.clocks = replace(self.clocks, visits=self.clocks.visits + 1)
+    def end_visit(self, counts: bool) -> None:
+        """A visit has ended, which may count."""
+        self.growth.pop(LARGEST, None)
+        self.clocks = replace(self.clocks, visits=self.clocks.visits + counts)
 
     def refine(self, infos: Infos, judged: Sequence[Judged], clock: DensityClock) -> None:
         """Grow and prune, where it is time for that.
@@ -97,7 +106,28 @@ class ActiveBlock:
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, judged, clock)
         if run.density.refines(clock, self.growth):
             self.clocks = replace(self.clocks, refined=clock.steps)
-            self.shrink_oversized()
+            self.growth.pop(LARGEST, None)
+        self._hold_sizes()
+
+    @torch.no_grad()
+    def _hold_sizes(self) -> None:
+        """Nothing becomes oversized but what fills much of the block's views, as a plain background may. What is
+        so already stays, for no step has seen pictures without it."""
+        run = self._run
+        if not run.health.may_act:
+            return
+        if LARGEST not in self.growth:
+            self.growth[LARGEST] = run.health.largest(run.views.values(), self._filling())
+        else:
+            torch.minimum(run.params["scales"], self.growth[LARGEST], out=run.params["scales"].data)
+
+    def _filling(self) -> Bool[Tensor, "n"]:
+        """Which Gaussians are known to fill more than FILLS of the block's views."""
+        run = self._run
+        if not have_contributions(self.growth):
+            return torch.zeros(len(self), dtype=torch.bool, device=run.device)
+        pixels = sum(run.views[view].full.pixels for view in run.active.trained_on)
+        return contributions(self.growth) > FILLS * pixels
 
     def judge(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
@@ -153,9 +183,3 @@ class ActiveBlock:
         """Whether the one block of the scene has just grown to where it must be cut."""
         grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
         return grown and is_full(len(self), 1, self._run.config.limits)
-
-    def shrink_oversized(self) -> None:
-        """Shrink what is too large for every camera, while there is time to make good what is missed: a plain
-        background may be nothing but oversized Gaussians."""
-        if self._run.share < LAST:
-            self._run.health.shrink_oversized(self._run.views.values())
