@@ -111,8 +111,8 @@ class ActiveBlock:
 
     @torch.no_grad()
     def _hold_sizes(self) -> None:
-        """Nothing becomes oversized but what fills much of the block's views, as a plain background may. What is
-        so already stays, for no step has seen pictures without it."""
+        """Nothing becomes oversized but what fills much of the block's views, as a plain background may.
+        What is so already stays: no step has seen pictures without it."""
         run = self._run
         if not run.health.may_act:
             return
