@@ -18,7 +18,9 @@ Method = Literal[
 METHODS: tuple[str, ...] = get_args(Method)
 """In the order in which tables and charts show them."""
 HELD_OUT_EVERY = 8
-"""Views 0, 8, 16, ... of the list sorted by name are never trained on, as in the papers of the field."""
+"""One view in so many is never trained on: 0, 8, 16, ... of the list sorted by name, as in the papers of the
+field, or a sector."""
+HoldOut = Literal["interval", "sector"]
 AS_IT_IS = "default"
 """Name of the variant without changes."""
 
@@ -48,6 +50,8 @@ class Settings:
     densify: bool
     pictures: int
     """Held-out views that are shown."""
+    hold_out: HoldOut = "interval"
+    """See `AbcdDataParserConfig.eval_mode`."""
 
     @property
     def scene(self) -> str:

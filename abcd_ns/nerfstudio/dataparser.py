@@ -32,10 +32,11 @@ class AbcdDataParserConfig(SceneOptions):
 
     _target: type = field(default_factory=lambda: AbcdDataParser)
     """target class to instantiate"""
-    eval_mode: Literal["auto", "interval", "fraction", "all"] = "auto"
+    eval_mode: Literal["auto", "interval", "fraction", "sector", "all"] = "auto"
     """Which photos are held out. auto follows the data's own lists, and is interval without any.
     interval: every n-th by name, see `eval_interval`. all: none, all are trained on and evaluated.
-    fraction: a tenth, evenly spaced, as nerfstudio-data does."""
+    fraction: a tenth, evenly spaced, as nerfstudio-data does.
+    sector: one in n again, but all from one place, at an end of where the photos were taken."""
     eval_interval: int = 8
     """Photos 0, n, 2n, ... by name are held out; at least 2."""
     train_split_fraction: float = 0.9
@@ -107,7 +108,9 @@ class AbcdDataParser(DataParser):
         scene = self.prepared().scene
         if scene.split_lists and self.config.eval_mode == "auto":
             return scene.split_lists.rows([frame.name for frame in scene.frames], split)
-        return split_rows(len(scene.frames), split, self.config)
+        return split_rows(
+            np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames]), split, self.config
+        )
 
     def _generate_dataparser_outputs(self, split: str = "train", **_kwargs: Any) -> AbcdDataparserOutputs:
         prepared, rows, as_stored = self.prepared(), self.rows(split), self.config.as_stored
@@ -128,10 +131,11 @@ class AbcdDataParser(DataParser):
         )
 
 
-def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int]:
-    """Rows of the name-sorted list of `count` views that belong to `split`, by eval_mode and eval_interval.
+def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataParserConfig) -> list[int]:
+    """Rows of the name-sorted list of views that belong to `split`, by eval_mode and eval_interval.
 
     Args:
+        centers: of the views' cameras.
         split: "train", or "val" or "test" for the views held out.
 
     Raises:
@@ -140,6 +144,7 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
     """
     if split not in ("train", "val", "test"):
         raise ValueError(f"There is no split {split}; there are train, val and test.")
+    count = len(centers)
     if config.eval_mode == "all":
         return list(range(count))
     if config.eval_mode == "fraction":
@@ -153,7 +158,19 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
     if config.eval_interval < 2:
         least = "must be 2 or more; or set eval-mode all"
         raise InputError(f"{OPTION}eval-interval {config.eval_interval} {least}.")
-    return [row for row in range(count) if (row % config.eval_interval == 0) == (split != "train")]
+    held_out = range(0, count, config.eval_interval)
+    if config.eval_mode == "sector":
+        held_out = sector(centers, len(held_out))
+    return [row for row in range(count) if (row in held_out) == (split != "train")]
+
+
+def sector(centers: Float[np.ndarray, "n 3"], count: int) -> frozenset[int]:
+    """`count` rows: the camera that is outermost in the direction of largest spread, and those nearest to it."""
+    offsets = centers - centers.mean(axis=0)
+    _, _, axes = np.linalg.svd(offsets, full_matrices=False)
+    outermost = int(np.abs(offsets @ axes[0]).argmax())
+    away = np.linalg.norm(centers - centers[outermost], axis=1)
+    return frozenset(np.argsort(away, kind="stable")[:count].tolist())
 
 
 def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:

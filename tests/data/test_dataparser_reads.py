@@ -99,14 +99,26 @@ def test_default_frame_is_nerfstudios(scene):
 @given(count=st.integers(2, 60), interval=st.integers(2, 12))
 @settings(derandomize=True, max_examples=40, deadline=None)
 def test_splits_partition_the_views(count, interval):
-    config = AbcdDataParserConfig(eval_interval=interval)
-    train, test, val = (split_rows(count, split, config) for split in ("train", "test", "val"))
+    centers, config = np.zeros((count, 3)), AbcdDataParserConfig(eval_interval=interval)
+    train, test, val = (split_rows(centers, split, config) for split in ("train", "test", "val"))
     assert test == val == list(range(0, count, interval))
     assert sorted(train + test) == list(range(count))
     everything = AbcdDataParserConfig(eval_mode="all")
     assert (
-        split_rows(count, "train", everything) == split_rows(count, "test", everything) == list(range(count))
+        split_rows(centers, "train", everything)
+        == split_rows(centers, "test", everything)
+        == list(range(count))
     )
+
+
+def test_a_sector_is_held_out_at_an_end_of_the_capture():
+    angles = np.random.default_rng(0).permutation(np.linspace(0, np.pi, 24))
+    centers = np.stack((4 * np.cos(angles), np.sin(angles), np.zeros(24)), axis=1) + 100.0
+    config = AbcdDataParserConfig(eval_mode="sector", eval_interval=8)
+    train, held_out = (split_rows(centers, split, config) for split in ("train", "val"))
+    assert sorted(train + held_out) == list(range(24))
+    assert {len(held_out)} == {3}
+    assert sorted(np.argsort(angles).argsort()[held_out]) in ([0, 1, 2], [21, 22, 23])
 
 
 @pytest.mark.parametrize("folder", ["sparse/0", "colmap/sparse/0", "sparse"])

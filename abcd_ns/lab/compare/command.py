@@ -16,7 +16,17 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.budgets import ALONE, JOINT, WITHIN, draw_budgets, shares_of, within_budgets
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
-from abcd_ns.lab.job import METHODS, Job, Method, Plan, Settings, TerrainJob, TerrainSettings, scene_name
+from abcd_ns.lab.job import (
+    METHODS,
+    HoldOut,
+    Job,
+    Method,
+    Plan,
+    Settings,
+    TerrainJob,
+    TerrainSettings,
+    scene_name,
+)
 from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
@@ -65,6 +75,8 @@ class Options:
     budgets: Annotated[tuple[str, ...] | None, words("SHARE ...")] = None
     """An arm for each share, such as 1/4, of the memory that abcd-monolithic takes for Gaussians.
     Each method of ABCD's keeps to it. abcd-monolithic and splatfacto also run without a limit."""
+    hold_out: HoldOut | None = None
+    """Which views are not trained on: every 8th by name, or an eighth from one place. Default: interval."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
     max_gaussians: Annotated[int | None, words("N")] = None
@@ -94,6 +106,7 @@ DEFAULTS = Options(
     blocks=(8,),
     prices=(),
     vary=(),
+    hold_out="interval",
     evals=8,
     max_gaussians=0,
     pictures=3,
@@ -325,6 +338,7 @@ def _settings(given: Options) -> Settings:
         max_gaussians=given.max_gaussians,
         densify=not given.no_densify,
         pictures=given.pictures,
+        hold_out=given.hold_out,
     )
 
 

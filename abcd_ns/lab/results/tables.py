@@ -136,6 +136,7 @@ def rows(results: Results) -> Rows:
         table.append([measure.title, *(cell(arm.runs, measure) for arm in results.arms)])
         if measure.field == "psnr_merged":
             table.append(["difference (dB)", *(_difference(arm, results) for arm in results.arms)])
+            table.append(["worst view (dB)", *(_worst_view(arm, results) for arm in results.arms)])
     table = [row for row in table if set(row[1:]) != {NOTHING}]
     many = len(results.arms) > MOST_COLUMNS
     return [list(column) for column in zip(*table, strict=True)] if many else table
@@ -147,6 +148,15 @@ def _difference(arm: Arm, results: Results) -> str:
     theirs = {run.seed: run.psnr_merged for run in base.runs} if base and results.settings else {}
     pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
     return mean_of(pairs, "+.2f") if pairs else NOTHING
+
+
+def _worst_view(arm: Arm, results: Results) -> str:
+    """How far a held-out view lies from the same of abcd-monolithic, in the view where that is worst."""
+    joint = {run.seed: run for one in results.of("abcd-monolithic")[:1] for run in one.runs}
+    pairs = [(run, joint[run.seed]) for run in arm.runs if run.seed in joint and joint[run.seed] is not run]
+    views = [zip(run.views, other.views, strict=True) for run, other in pairs if run.views]
+    found = [min(ours.psnr_merged - theirs.psnr_merged for ours, theirs in pair) for pair in views]
+    return mean_of(found, "+.2f") if found else NOTHING
 
 
 def notes(results: Results) -> list[str]:
@@ -163,6 +173,8 @@ def notes(results: Results) -> list[str]:
     if footings := [run.memory for run in results.runs if run.memory is not None]:
         base = min(footing.base_rss_bytes for footing in footings) / MIB
         found.append(f"Of the RAM, {base:,.0f} MiB are Python, torch and kernels, before any scene.")
+    if any(_worst_view(arm, results) != NOTHING for arm in results.arms):
+        found.append("Worst view: merged PSNR less abcd-monolithic's, in the view where that is least.")
     if len(results.seeds) > 1:
         found.append("Numbers are means over the seeds ± their standard deviation.")
     if any(results.baseline(arm) for arm in results.arms):
@@ -186,6 +198,8 @@ def _protocol(results: Results) -> str:
     conditions += [] if s.densify else ["the number of Gaussians fixed"]
     conditions += [f"at most {s.max_gaussians:,} Gaussians"] if s.max_gaussians else []
     held_out = f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on"
+    if s.hold_out == "sector":
+        held_out = f"one view in {HELD_OUT_EVERY}, all from one place"
     return f"Scene {s.scene} at 1/{s.downscale} of its size; held out: {held_out}; {', '.join(conditions)}."
 
 

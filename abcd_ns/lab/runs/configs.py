@@ -120,6 +120,6 @@ def _parser(job: Job) -> AbcdDataParserConfig:
     return AbcdDataParserConfig(
         data=Path(settings.data),
         downscale_factor=settings.downscale,
-        eval_mode="interval",
+        eval_mode=settings.hold_out,
         eval_interval=HELD_OUT_EVERY,
     )

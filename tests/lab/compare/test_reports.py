@@ -104,6 +104,18 @@ def test_changes_have_their_difference_to_the_method_as_it_is_seed_by_seed():
     assert not any(row[0] == "difference (dB)" for row in rows(alone))
 
 
+def test_the_worst_view_is_held_against_the_same_of_one_block():
+    def run(method, *psnrs):
+        views = (ViewScore(k, f"{k}.png", p, None, None, p, None) for k, p in enumerate(psnrs))
+        return made_up_run(method, views=tuple(views))
+
+    joint, blocks = run("abcd-monolithic", 20.0, 30.0), run("abcd", 20.5, 28.0)
+    results = made_up_results(joint, blocks)
+    assert ["worst view (dB)", "-", "-2.00"] in rows(results)
+    assert any("Worst view" in note for note in notes(results))
+    assert not any("worst view (dB)" in row for row in rows(made_up_results(blocks)))
+
+
 def test_a_change_is_held_against_the_same_number_of_blocks():
     names = ("blocks=1", "blocks=1 training.batch=1", "blocks=8", "blocks=8 training.batch=1")
     results = made_up("comparison", *(made_up_arm(name, None, {0: 20.0}) for name in names))
