@@ -213,7 +213,7 @@ def _check_box(words: list[str], means: Float[Tensor, "n 3"]) -> None:
     if Path(words[0]).stem == "ns-export" and None not in given:
         box = OrientedBox.from_params(*(tuple(map(float, values.split())) for values in given))
         if not box.within(means.detach().cpu()).any():
-            raise UserError("No Gaussian lies in this box: correct --obb-center or enlarge --obb-scale.")
+            raise UserError("No Gaussian lies in this box: move it, or make it larger.")
 
 
 def _say(line: str) -> None:
