@@ -13,7 +13,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.errors import IMPORT_TROUBLE, missing
-from abcd_ns.nerfstudio.flags import trains_ours
+from abcd_ns.nerfstudio.flags import check_config, trains_ours
 
 try:
     from abcd_ns.data.input_errors import exit_on_user_error
@@ -22,10 +22,11 @@ try:
 except IMPORT_TROUBLE as error:
     _methods, _trouble = None, missing(error)
 else:
-    if trains_ours(sys.argv):  # before tyro reads them, which knows no reasons
-        with exit_on_user_error():
-            if (_named := getattr(_methods, sys.argv[1].replace("-", "_"), None)) is not None:
-                refuse_flags(sys.argv[2:], _named.config)
+    with exit_on_user_error():  # before tyro and nerfstudio read them, which know no reasons
+        check_config(sys.argv)
+        _named = getattr(_methods, sys.argv[1].replace("-", "_"), None) if trains_ours(sys.argv) else None
+        if _named is not None:
+            refuse_flags(sys.argv[2:], _named.config)
 
 
 @dataclass

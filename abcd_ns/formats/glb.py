@@ -80,13 +80,19 @@ def values(gaussians: Gaussians) -> list[np.ndarray]:
 
 
 def write_glb(
-    path: Path, count: int, sh_degree: int, up: Float[Tensor, "3 3"], parts: Iterable[Gaussians]
+    path: Path,
+    count: int,
+    sh_degree: int,
+    up: Float[Tensor, "3 3"],
+    parts: Iterable[Gaussians],
+    antialiased: bool = False,
 ) -> None:
     """Write Gaussians as they come, `count` in all.
 
     Args:
         up: turns the frame that the Gaussians are in, so that y is up. A node of the file says it: the
             values stay those of that frame.
+        antialiased: noted in the extras of the primitive; the extension has no field for it.
 
     Raises:
         UserError: they are too many for one file.
@@ -94,6 +100,8 @@ def write_glb(
     columns = attributes(sh_degree)
     starts = list(accumulate((column.stride * count for column in columns), initial=0))
     document = _document(columns, starts, count, up)
+    if antialiased:
+        document["meshes"][0]["primitives"][0]["extras"] = {"antialiased": True}
     words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
     head = 12 + 8 + words + 8
     total = head + starts[-1]

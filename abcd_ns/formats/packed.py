@@ -1,12 +1,16 @@
 """Smaller files, by the package gaussforge, all at once: .spz, .sog and .compressed.ply."""
 
+import gzip
+import io
+import json
+import zipfile
 from collections.abc import Iterable
 
 import numpy as np
 
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
-from abcd_ns.formats.ply import columns, header, rows
+from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
 
 BYTES_AT_ONCE = 1000
 """RAM that a Gaussian of degree 3 needs while it is packed: its row, and up to 755 bytes (.spz), measured."""
@@ -20,7 +24,9 @@ def check_installed() -> None:
         raise UserError(f"gaussforge is not there ({error}): pip install 'abcd-ns[export]'.") from None
 
 
-def packed(count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) -> bytes:
+def packed(
+    count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians], antialiased: bool = False
+) -> bytes:
     """A file of Gaussians, `count` in all, once all are there.
 
     Args:
@@ -42,7 +48,25 @@ def packed(count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) ->
     found = gaussforge.GaussForge().convert(whole, "ply", kind)
     if "error" in found:
         raise UserError(f".{kind} cannot be written: gaussforge says {found['error']}.")
-    return found["data"]
+    return _marked(found["data"], kind) if antialiased else found["data"]
+
+
+def _marked(data: bytes, kind: str) -> bytes:
+    """The file with its format's mark of antialiased training, which gaussforge 0.6 never sets."""
+    if kind == "compressed.ply":
+        return data.replace(b"\n", f"\n{ANTIALIASED}\n".encode(), 1)
+    if kind == "spz":
+        content = bytearray(gzip.decompress(data))
+        content[14] |= 1  # the flags of its header
+        return gzip.compress(content)
+    made = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "meta.json":
+                content = json.dumps({**json.loads(content), "antialias": True}).encode()
+            new.writestr(name, content)
+    return made.getvalue()
 
 
 def _transpose(table: np.ndarray, sh_degree: int) -> None:

@@ -9,6 +9,8 @@ from abcd_ns import __version__
 from abcd_ns.engine.types import Gaussians
 
 GENERATOR = f"abcd_ns {__version__}"
+ANTIALIASED = "comment antialiased"
+"""A line of the header: opacities are to be compensated for the low-pass filter."""
 
 
 def columns(sh_degree: int) -> list[str]:
@@ -39,16 +41,18 @@ def rows(gaussians: Gaussians) -> np.ndarray:
     return np.concatenate([value.float().cpu().numpy() for value in values], axis=1).astype("<f4", copy=False)
 
 
-def header(count: int, sh_degree: int) -> bytes:
+def header(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     """What comes before the rows of `count` Gaussians."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in columns(sh_degree)]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}", *[ANTIALIASED][:antialiased]]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in columns(sh_degree))]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
-def write_ply(path: Path, count: int, sh_degree: int, parts: Iterable[Gaussians]) -> None:
+def write_ply(
+    path: Path, count: int, sh_degree: int, parts: Iterable[Gaussians], antialiased: bool = False
+) -> None:
     """Write Gaussians as they come, `count` in all."""
     with path.open("wb") as file:
-        file.write(header(count, sh_degree))
+        file.write(header(count, sh_degree, antialiased))
         for gaussians in parts:
             file.write(rows(gaussians).tobytes())

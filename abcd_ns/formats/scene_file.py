@@ -63,7 +63,13 @@ def rounding(suffix: str, largest: float) -> float:
 
 
 def write_scene(
-    path: Path, suffix: str, count: int, sh_degree: int, up: Float[Tensor, "3 3"], parts: Iterable[Gaussians]
+    path: Path,
+    suffix: str,
+    count: int,
+    sh_degree: int,
+    up: Float[Tensor, "3 3"],
+    parts: Iterable[Gaussians],
+    antialiased: bool = False,
 ) -> None:
     """Write Gaussians as they come.
 
@@ -71,17 +77,18 @@ def write_scene(
         suffix: of SUFFIXES.
         count: how many there will be; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
+        antialiased: mark the file so: its opacities are to be compensated for the low-pass filter.
 
     Raises:
         RuntimeError: there were more, or fewer.
     """
     parts = _counted(parts, count)
     if suffix == ".ply":
-        write_ply(path, count, sh_degree, parts)
+        write_ply(path, count, sh_degree, parts, antialiased)
     elif suffix == ".glb":
-        write_glb(path, count, sh_degree, up, parts)
+        write_glb(path, count, sh_degree, up, parts, antialiased)
     else:
-        path.write_bytes(packed(count, sh_degree, suffix[1:], parts))
+        path.write_bytes(packed(count, sh_degree, suffix[1:], parts, antialiased))
 
 
 def _counted(parts: Iterable[Gaussians], count: int) -> Iterator[Gaussians]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
+import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 
 from abcd_ns.data.input_errors import exit_on_user_error
@@ -29,9 +30,33 @@ def trains_ours(words: Sequence[str]) -> bool:
 
 def opened(words: Sequence[str]) -> Path | None:
     """The config.yml that ns-eval, ns-viewer, ns-render or ns-export is to open; None of other commands."""
-    path = _value(words, "--load-config")
+    path = value_of(words, "--load-config")
     tool = Path(words[0]).stem
     return Path(path) if path and tool.startswith("ns-") and tool != "ns-train" else None
+
+
+def check_config(words: Sequence[str]) -> None:
+    """See that the config.yml of ours that a command line names is one, before nerfstudio reads it.
+
+    Raises:
+        UserError: it is not; says what to give.
+    """
+    name = value_of(words, "--load-config")
+    path = Path(name or "")
+    folder = path / "config.yml" if path.is_dir() else path
+    if not name or not (trains_ours(words) or opens_ours([words[0], "--load-config", str(folder)])):
+        return
+    try:
+        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except OSError as error:
+        refused = f"{path} cannot be read ({error.strerror})"
+    except (yaml.YAMLError, UnicodeDecodeError):
+        refused = f"{path} is damaged"
+    else:
+        if root is not None and root.tag.startswith("tag:yaml.org,2002:python/object"):
+            return
+        refused = f"{path} describes no run"
+    raise UserError(f"{refused}: give --load-config outputs/SCENE/METHOD/TIME/config.yml.")
 
 
 def opens_ours(words: Sequence[str]) -> bool:
@@ -62,10 +87,10 @@ def check_tool(words: Sequence[str]) -> None:
         raise UserError(f"ns-export {what} cannot draw Gaussians; `abcd mesh {config.parent}` makes a mesh.")
     if tool == "ns-render" and what == "spiral":
         raise UserError("ns-render spiral is for methods that train on rays: use ns-render interpolate.")
-    out = _value(words, "--output-path")
+    out = value_of(words, "--output-path")
     if tool == "ns-eval" and out and not out.endswith(".json"):
         raise UserError(f"--output-path {out} must end in .json.")
-    if (path := _value(words, "--camera-path-filename")) is not None:
+    if (path := value_of(words, "--camera-path-filename")) is not None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -83,17 +108,17 @@ def check_held_out(words: Sequence[str]) -> None:
     flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
     if tool == "ns-eval":
         raise UserError("This run's data holds no photos out, so there is nothing to score.")
-    if tool == "ns-render" and flag and _value(words, flag) != "train":
+    if tool == "ns-render" and flag and value_of(words, flag) != "train":
         raise UserError(f"This run's data holds no photos out: add {flag} train.")
 
 
-def _value(words: Sequence[str], flag: str) -> str | None:
-    """What a command line gives for a flag; None where it does not name it."""
+def value_of(words: Sequence[str], flag: str, count: int = 1) -> str | None:
+    """What a command line gives for a flag, `count` words; None where it does not name it."""
     flags = [word.partition("=")[0].replace("_", "-") for word in words]
     if flag not in flags:
         return None
     place = flags.index(flag)
-    return words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
+    return words[place].partition("=")[2] or " ".join(words[place + 1 : place + 1 + count])
 
 
 def hidden(*names: str) -> Callable[[type], type]:

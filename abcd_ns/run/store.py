@@ -41,6 +41,7 @@ class MadeFor:
     """In turn, jointly, or each alone: what the store holds besides blocks depends on it."""
     sh_degree: int
     primitive: PrimitiveName
+    antialiased: bool = False
 
     @staticmethod
     def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
@@ -51,7 +52,8 @@ class MadeFor:
         first_camera = [round(value, 3) for value in views[0].center.tolist()]
         recipe = training.recipe
         how = "jointly" if recipe.exact else "each alone" if recipe.overlap > 0 else "in turn"
-        return MadeFor(digest.hexdigest(), first_camera, how, training.sh_degree, training.primitive)
+        drawn = training.sh_degree, training.primitive, training.antialiased
+        return MadeFor(digest.hexdigest(), first_camera, how, *drawn)
 
     def check(self, store: ParameterStore) -> None:
         """See that `store` was made for the same.
@@ -69,10 +71,9 @@ class MadeFor:
         theirs, mine = store.header.get(MADE_FOR), asdict(self)
         if theirs is None:  # nothing was written down
             return ""
-        different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
-        return "; ".join(
-            f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different
-        )
+        theirs = {**mine, **theirs}  # older versions wrote down less
+        different = [name for name in mine if not _agree(theirs[name], mine[name])]
+        return "; ".join(f"{name.replace('_', ' ')} {theirs[name]}, not {mine[name]}" for name in different)
 
     def header(self) -> dict[str, Any]:
         """The entry of a new store's header."""

@@ -36,10 +36,14 @@ def scene():
 
 @pytest.fixture
 def run(scene, tmp_path):
+    return write_run(tmp_path / "run", scene)
+
+
+def write_run(folder, scene, **header):
     """A run's folder, as far as exporting goes."""
-    folder, tree = tmp_path / "run", build_kd(scene.means, BLOCKS)
+    tree = build_kd(scene.means, BLOCKS)
     folder.mkdir()
-    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
         store.commit(blocks_at_rest(tree, scene), state=RunState().to_json())
     matrix = torch.cat((FRAME.rotation, FRAME.translation[:, None]), dim=1)
     (folder / TRANSFORMS).write_text(json.dumps({"transform": matrix.tolist(), "scale": FRAME.scale}))

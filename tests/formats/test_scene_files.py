@@ -22,7 +22,8 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import EXTENSION, Z_TO_Y, write_glb
 from abcd_ns.formats.scene_file import SUFFIXES, ply_bytes, spz_bytes, suffix_of, write_scene
-from tests.cli.test_export import FRAME, run, scene  # noqa: F401
+from abcd_ns.run.store import MadeFor
+from tests.cli.test_export import FRAME, run, scene, write_run  # noqa: F401
 from tests.reference.scenes import random_gaussians
 
 
@@ -219,6 +220,36 @@ def test_the_suffix_chooses_and_what_it_takes_is_said(run, tmp_path, capsys):  #
     files = sorted((tmp_path / "parts.glb").iterdir())
     assert [file.name for file in files] == [f"block-{n:04d}.glb" for n in range(1, 6)]
     assert sum(len(read_glb(file)[1]["POSITION"]) for file in files) == 299
+
+
+def marked(path) -> bool:
+    """Whether a file says that its Gaussians were trained antialiased, where readers of its format look."""
+    content = path.read_bytes()
+    if path.suffix == ".ply":
+        return any("antialiased" in comment for comment in PlyData.read(str(path)).comments)
+    if path.suffix == ".spz":  # nianticlabs/spz: bit 0 of the flags
+        return gzip.decompress(content)[14] & 1 == 1
+    if path.suffix == ".sog":
+        return json.loads(zipfile.ZipFile(io.BytesIO(content)).read("meta.json"))["antialias"]
+    primitive = read_glb(path)[0]["meshes"][0]["primitives"][0]
+    return primitive.get("extras", {}).get("antialiased", False)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_antialiased_runs_are_marked(run, scene, tmp_path, suffix, capsys):  # noqa: F811
+    header = MadeFor("0", [0.0, 0.0, 0.0], "in turn", 3, "3dgs", antialiased=True).header()
+    plain, made = (tmp_path / f"{name}{suffix}" for name in ("plain", "made"))
+    export(run, out=plain)
+    assert not marked(plain)
+    assert "Trained antialiased" not in capsys.readouterr().out
+    export(write_run(tmp_path / "other", scene, **header), out=made)
+    assert marked(made)
+    assert "enable antialiasing in the viewer" in capsys.readouterr().out
+    if suffix in (".spz", ".sog", ".compressed.ply"):
+        import gaussforge
+
+        plys = (gaussforge.GaussForge().convert(f.read_bytes(), suffix[1:], "ply") for f in (plain, made))
+        assert len({found["data"] for found in plys}) == 1
 
 
 def test_suffixes_are_told_apart_and_others_refused(tmp_path):

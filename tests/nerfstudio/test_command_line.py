@@ -11,7 +11,7 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import entrypoint
 
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.flags import check_held_out, check_tool, opens_ours, trains_ours
+from abcd_ns.nerfstudio.flags import check_config, check_held_out, check_tool, opens_ours, trains_ours
 from abcd_ns.nerfstudio.inspection import where_data_is
 from tests.reference.colmap_scene import write_scene
 
@@ -68,6 +68,30 @@ def test_an_option_of_a_file_that_is_none_here_is_one_line(tmp_path):
 def test_command_lines_about_our_methods_are_known(line, ours):
     words = line.split()
     assert (trains_ours(words) or opens_ours(words)) == ours
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (None, "No such file"),
+        ("a: [1,", "is damaged"),
+        ("- 1", "describes no run"),
+        ("", "describes no run"),
+        ("folder", "Is a directory"),
+        ("!!python/object:abcd_ns.nerfstudio.trainer.AbcdTrainerConfig {}", ""),
+    ],
+)
+@pytest.mark.parametrize("tool", ["ns-train abcd", "ns-eval", "ns-viewer", "ns-export gaussian-splat"])
+def test_a_config_that_is_none_is_one_line_before_it_is_read(tool, content, why, tmp_path):
+    path = tmp_path / "fox/abcd/now/config.yml"
+    path.parent.mkdir(parents=True)
+    if content not in (None, "folder"):
+        path.write_text(content)
+    words = [*tool.split(), "--load-config", str(path.parent if content == "folder" else path)]
+    expected = pytest.raises(UserError, match=f"{why}.*give --load-config outputs/") if why else nullcontext()
+    with expected:
+        check_config(words)
+    check_config(["ns-eval", "--load-config", "fox/splatfacto/now/config.yml"])
 
 
 REFUSED = {

@@ -289,6 +289,9 @@ def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stop
     other = configure(data, tmp_path / "b", load_dir=stopped)
     other.pipeline.training.recipe = Recipe(exact=True)
     assert "blocks are trained in turn, not jointly" in refusal(other, capsys, late=True)
+    soft = configure(data, tmp_path / "b", load_dir=stopped)
+    soft.pipeline.training.antialiased = True
+    assert "antialiased False, not True" in refusal(soft, capsys, late=True)
 
 
 def test_another_number_of_blocks_is_refused(data, stopped, tmp_path, capsys):

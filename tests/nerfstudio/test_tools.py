@@ -225,6 +225,18 @@ def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
     assert "error: Camera 0 is fisheye" in capsys.readouterr().out
 
 
+def test_a_box_without_gaussians_ends_an_export_in_one_line(trained, monkeypatch, capsys):
+    box = ["--obb_center", "9", "9", "9", "--obb-rotation", "0", "0", "0", "--obb_scale"]
+    words = ["ns-export", "gaussian-splat", "--load-config", str(trained / "config.yml"), *box]
+    monkeypatch.setattr("sys.argv", [*words, "99", "99", "99"])
+    eval_setup(trained / "config.yml")
+    monkeypatch.setattr("sys.argv", [*words, "0.1", "0.1", "0.1"])
+    with pytest.raises(SystemExit) as ended:
+        eval_setup(trained / "config.yml")
+    assert ended.value.code == 2
+    assert "error: No Gaussian lies in this box" in capsys.readouterr().out
+
+
 def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
     config = AbcdModelConfig(sh_degree=0)
     model = config.setup(scene_box=SceneBox(torch.zeros(2, 3)), num_train_data=1)

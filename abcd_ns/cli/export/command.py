@@ -131,7 +131,7 @@ def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list
     up = Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
     parts = (scene.gaussians(block) for block in _steps(counts, "writing"))
     with replacing(out) as partial:
-        write_scene(partial, suffix, sum(counts.values()), scene.sh_degree, up, parts)
+        write_scene(partial, suffix, sum(counts.values()), scene.sh_degree, up, parts, scene.antialiased)
         rounding(suffix, scene.largest)
     return [out]
 
@@ -158,6 +158,8 @@ def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffi
     where = written[0] if len(written) == 1 else f"{written[0].parent} ({len(written)} files)"
     print(f"{where}: {count:,} Gaussians, {size / 2**20:.1f} MiB, {size / count:.0f} bytes each")
     tell_rounding(suffix, scene.largest, scene.size)
+    if scene.antialiased:
+        print("Trained antialiased: enable antialiasing in the viewer, or thin things look too thick.")
 
 
 def tell_rounding(suffix: str, largest: float, size: float) -> None:

@@ -16,6 +16,7 @@ from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.scene_file import shows
+from abcd_ns.run.store import MADE_FOR
 
 Box = tuple[float, float, float, float, float, float]
 """x, y and z of its lower and then of its upper corner."""
@@ -55,6 +56,11 @@ class Shown:
     def sh_degree(self) -> int:
         """Of all its Gaussians."""
         return Gaussians(**self._load(0, PARAM_NAMES)).sh_degree
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether it was trained so."""
+        return self.store.header.get(MADE_FOR, {}).get("antialiased", False)
 
     @property
     def largest(self) -> float:

@@ -110,7 +110,7 @@ class ProgressReport:
             self._live = None
         state = self._coordinator.state
         CONSOLE.print(
-            f"Trained {state.step:,} steps in {state.visit} visits, "
+            f"Trained {state.step:,} steps in {state.visit} visit{'s'[: state.visit != 1]}, "
             f"{clock(self._coordinator.stopwatch.seconds)}: {self._summary()}.",
             highlight=False,
             soft_wrap=True,

@@ -54,7 +54,7 @@ def find_start(config: TrainerConfig) -> Start | None:
     if not store.is_dir():
         if any((run / config.relative_model_dir).glob("step-*.ckpt")):
             raise _view_only(run, f"the folder {store} is missing")
-        raise UserError(f"There is no run of ABCD in {config.load_dir}: it has no {store}.")
+        raise UserError(f"There is no run of ABCD in {config.load_dir}: give outputs/SCENE/METHOD/TIME.")
     return _at(store, None)
 
 
@@ -103,7 +103,7 @@ def _view_only(path: Path, why: str) -> UserError:
 
 def _at_checkpoint(path: Path) -> Start:
     if not path.exists():
-        raise UserError(f"There is no checkpoint {path}.")
+        raise UserError(f"There is no checkpoint {path}: give a step-*.ckpt of a run's nerfstudio_models.")
     store = path.absolute().parent.parent / STATE / STORE
     if not store.is_dir():
         raise _view_only(path, f"the folder {store} is missing")
