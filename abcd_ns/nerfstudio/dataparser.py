@@ -165,7 +165,7 @@ def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataPa
 
 
 def sector(centers: Float[np.ndarray, "n 3"], count: int) -> frozenset[int]:
-    """`count` rows: the camera that is outermost in the direction of largest spread, and those nearest to it."""
+    """`count` rows: of the camera that is outermost where they spread most, and of those nearest to it."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     outermost = int(np.abs(offsets @ axes[0]).argmax())
