@@ -1,6 +1,7 @@
-"""Every command that the documents show is one that the programs take."""
+"""Commands in the documents are understood, links lead somewhere, README's decibels are of stored runs."""
 
 import functools
+import json
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -22,6 +23,8 @@ from abcd_ns.errors import UserError
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 DOCUMENTS.append(ROOT / "docs" / "results" / "README.md")
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+LINK = re.compile(r"\]\(([^)]+)\)|<img src=\"([^\"]+)\"")
 NERFSTUDIO: dict[str, Any] = {
     "ns-train": AnnotatedBaseConfigUnion,
     "ns-eval": ComputePSNR,
@@ -85,3 +88,48 @@ def test_a_wrong_one_would_be_noticed(line):
 def test_there_are_commands_to_look_at():
     assert {"ns-train", "abcd"} <= {shlex.split(p.values[0], comments=True)[0] for p in SHOWN}
     assert len(SHOWN) > 20
+
+
+def anchors(text: str) -> set[str]:
+    """What a link may name after its #."""
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def dead_links(path: Path) -> Iterator[str]:
+    """Links of a page to files and headings of this repository that are not there."""
+    for link in ("".join(found) for found in LINK.findall(path.read_text().replace("\n", " "))):
+        name, _, anchor = link.partition("#")
+        there = path.parent / name if name else path
+        if "://" not in link and (
+            not there.exists() or (anchor and anchor not in anchors(there.read_text()))
+        ):
+            yield link
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(path):
+    assert list(dead_links(path)) == []
+
+
+def test_dead_links_would_be_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# Here\n[a](page.md#here) [b](#there) [c](gone.md) [d](https://a.b#c)\n")
+    assert list(dead_links(page)) == ["#there", "gone.md"]
+
+
+def final_psnr(value: Any) -> Iterator[float]:
+    """Held-out PSNR of every run in a JSON value, at its end."""
+    if isinstance(value, dict) and isinstance(value.get("psnr_merged"), float):
+        yield value["psnr_merged"]
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from final_psnr(each)
+
+
+def test_the_decibels_of_the_readme_are_of_stored_runs():
+    stored = (ROOT / "docs" / "results").rglob("*.json")
+    known = {f"{value:.2f}" for path in stored for value in final_psnr(json.loads(path.read_text()))}
+    said = re.findall(r"(?<![\d.])\d\d\.\d\d(?!\d|\.\d)", (ROOT / "README.md").read_text())
+    assert len(said) > 4
+    assert [value for value in said if value not in known] == []
