@@ -152,9 +152,10 @@ def _difference(arm: Arm, results: Results) -> str:
 
 def _worst_view(arm: Arm, results: Results) -> str:
     """How far a held-out view lies from the same of abcd-monolithic, in the view where that is worst."""
-    joint = {run.seed: run for one in results.of("abcd-monolithic")[:1] for run in one.runs}
+    arms = results.of("abcd-monolithic")[:1] if results.settings else ()
+    joint = {run.seed: run for one in arms for run in one.runs}
     pairs = [(run, joint[run.seed]) for run in arm.runs if run.seed in joint and joint[run.seed] is not run]
-    views = [zip(run.views, other.views, strict=True) for run, other in pairs if run.views]
+    views = [zip(run.views, other.views, strict=True) for run, other in pairs]
     found = [min(ours.psnr_merged - theirs.psnr_merged for ours, theirs in pair) for pair in views]
     return mean_of(found, "+.2f") if found else NOTHING
 
