@@ -154,6 +154,16 @@ def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
     assert coordinator.params["scales"][:2].amax(dim=1).tolist() == pytest.approx([6.0, 5.0], abs=0.1)
 
 
+def test_a_value_that_is_no_number_bounds_nothing(make, views, photos):
+    coordinator = make(blocks=1, steps=30, density=STILL)
+    train_step(coordinator, photos)
+    with torch.no_grad():
+        coordinator.params["means"][0] = coordinator.params["scales"][1] = math.nan
+    nobody = torch.zeros(len(coordinator.params["means"]), dtype=torch.bool)
+    largest = coordinator.health.largest(views, nobody)
+    assert bool((largest[:2] > 40).all())
+
+
 def test_stand_ins_are_numbers_even_among_none():
     for sound in (random_gaussians(7), Gaussians.empty(1)):
         made = stand_ins(sound, 3)

@@ -128,14 +128,15 @@ class Health:
 
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Logarithms of standard deviations that none may grow beyond, lest it be oversized.
+        """Logarithms of standard deviations that none may grow beyond, lest it be oversized. A value that is
+        no number bounds nothing.
 
         Args:
             spared: may grow as they like.
         """
         scales = self._params["scales"]
         _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
-        return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed))
+        return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
 
     def end_visit(self, detach: Callable[[], BlockState]) -> BlockState:
         """What the visit leaves behind: the live block, repaired.
