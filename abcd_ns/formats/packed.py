@@ -58,7 +58,7 @@ def _marked(data: bytes, kind: str) -> bytes:
     if kind == "spz":
         content = bytearray(gzip.decompress(data))
         content[14] |= 1  # the flags of its header
-        return gzip.compress(content)
+        return gzip.compress(content, mtime=0)
     made = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w") as new:
         for name in old.namelist():

@@ -43,7 +43,8 @@ def rows(gaussians: Gaussians) -> np.ndarray:
 
 def header(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     """What comes before the rows of `count` Gaussians."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}", *[ANTIALIASED][:antialiased]]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}"]
+    lines += [ANTIALIASED] if antialiased else []
     lines += [f"element vertex {count}", *(f"property float {name}" for name in columns(sh_degree))]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 

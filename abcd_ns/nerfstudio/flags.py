@@ -10,7 +10,10 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 import yaml
+from jaxtyping import Float
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.scene_box import OrientedBox
+from torch import Tensor
 
 from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
@@ -30,7 +33,7 @@ def trains_ours(words: Sequence[str]) -> bool:
 
 def opened(words: Sequence[str]) -> Path | None:
     """The config.yml that ns-eval, ns-viewer, ns-render or ns-export is to open; None of other commands."""
-    path = value_of(words, "--load-config")
+    path = _value(words, "--load-config")
     tool = Path(words[0]).stem
     return Path(path) if path and tool.startswith("ns-") and tool != "ns-train" else None
 
@@ -41,10 +44,10 @@ def check_config(words: Sequence[str]) -> None:
     Raises:
         UserError: it is not; says what to give.
     """
-    name = value_of(words, "--load-config")
+    name = _value(words, "--load-config")
     path = Path(name or "")
-    folder = path / "config.yml" if path.is_dir() else path
-    if not name or not (trains_ours(words) or opens_ours([words[0], "--load-config", str(folder)])):
+    meant = path / "config.yml" if path.is_dir() else path
+    if not name or not (trains_ours(words) or opens_ours([words[0], "--load-config", str(meant)])):
         return
     try:
         root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
@@ -87,10 +90,10 @@ def check_tool(words: Sequence[str]) -> None:
         raise UserError(f"ns-export {what} cannot draw Gaussians; `abcd mesh {config.parent}` makes a mesh.")
     if tool == "ns-render" and what == "spiral":
         raise UserError("ns-render spiral is for methods that train on rays: use ns-render interpolate.")
-    out = value_of(words, "--output-path")
+    out = _value(words, "--output-path")
     if tool == "ns-eval" and out and not out.endswith(".json"):
         raise UserError(f"--output-path {out} must end in .json.")
-    if (path := value_of(words, "--camera-path-filename")) is not None:
+    if (path := _value(words, "--camera-path-filename")) is not None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -108,11 +111,24 @@ def check_held_out(words: Sequence[str]) -> None:
     flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
     if tool == "ns-eval":
         raise UserError("This run's data holds no photos out, so there is nothing to score.")
-    if tool == "ns-render" and flag and value_of(words, flag) != "train":
+    if tool == "ns-render" and flag and _value(words, flag) != "train":
         raise UserError(f"This run's data holds no photos out: add {flag} train.")
 
 
-def value_of(words: Sequence[str], flag: str, count: int = 1) -> str | None:
+def check_box(words: Sequence[str], means: Float[Tensor, "n 3"]) -> None:
+    """See that the box of `ns-export gaussian-splat` holds something, which nerfstudio takes for granted.
+
+    Raises:
+        UserError: it holds none of the means.
+    """
+    given = [_value(words, f"--obb-{name}", 3) for name in ("center", "rotation", "scale")]
+    if Path(words[0]).stem == "ns-export" and None not in given:
+        box = OrientedBox.from_params(*(tuple(map(float, values.split())) for values in given))
+        if not box.within(means.detach().cpu()).any():
+            raise UserError("No Gaussian lies in this box: move it, or make it larger.")
+
+
+def _value(words: Sequence[str], flag: str, count: int = 1) -> str | None:
     """What a command line gives for a flag, `count` words; None where it does not name it."""
     flags = [word.partition("=")[0].replace("_", "-") for word in words]
     if flag not in flags:

@@ -3,18 +3,14 @@
 import sys
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from abcd_ns.data.ply import GREY
 from abcd_ns.engine.events import HeldOutScored
@@ -23,10 +19,9 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
-from abcd_ns.nerfstudio.flags import as_a_command, check_held_out, check_tool, opened, shown, value_of
+from abcd_ns.nerfstudio.flags import as_a_command, check_box, check_held_out, check_tool, opened, shown
 from abcd_ns.nerfstudio.inspection import factor_of, where_data_is
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
@@ -150,7 +145,7 @@ class AbcdPipeline(VanillaPipeline):
         """As VanillaPipeline's; cameras stand where their poses were refined to."""
         with as_a_command():
             super().load_pipeline(loaded_state, step)
-            _check_box(sys.argv, self.model.means)
+            check_box(sys.argv, self.model.means)
         self.datamanager.take_poses(self.model.poses)
 
     def _after_step(self) -> None:
@@ -201,19 +196,6 @@ class AbcdPipeline(VanillaPipeline):
             _say(f"The data has no points: {model.num_random:,} Gaussians begin {where}.")
         at_random = random_points(model.num_random, model.random_scale)
         return gaussians_of_cloud(*at_random, views, replace(training, point_pixels=0.0))
-
-
-def _check_box(words: list[str], means: Float[Tensor, "n 3"]) -> None:
-    """See that the box of `ns-export gaussian-splat` holds something, which nerfstudio takes for granted.
-
-    Raises:
-        UserError: it holds none of the means.
-    """
-    given = [value_of(words, f"--obb-{name}", 3) for name in ("center", "rotation", "scale")]
-    if Path(words[0]).stem == "ns-export" and None not in given:
-        box = OrientedBox.from_params(*(tuple(map(float, values.split())) for values in given))
-        if not box.within(means.detach().cpu()).any():
-            raise UserError("No Gaussian lies in this box: move it, or make it larger.")
 
 
 def _say(line: str) -> None:

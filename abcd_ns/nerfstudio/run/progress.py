@@ -109,8 +109,9 @@ class ProgressReport:
             self._live.stop()
             self._live = None
         state = self._coordinator.state
+        visits = "1 visit" if state.visit == 1 else f"{state.visit} visits"
         CONSOLE.print(
-            f"Trained {state.step:,} steps in {state.visit} visit{'s'[: state.visit != 1]}, "
+            f"Trained {state.step:,} steps in {visits}, "
             f"{clock(self._coordinator.stopwatch.seconds)}: {self._summary()}.",
             highlight=False,
             soft_wrap=True,
