@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 
 from abcd_ns.cluster.assignment import VisitOutcome, VisitTask
@@ -23,7 +24,7 @@ from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
 from abcd_ns.engine.train.training_loop import step_by
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View
@@ -151,14 +152,22 @@ class VisitWorker:
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
-        batch = training.next_batch()
-        targets = [self._target(sample) for sample in batch.samples]
-        rendered = training.render(batch)
-        rows = []
-        for sample, picture, (photo, counts) in zip(batch.samples, rendered.pictures, targets, strict=True):
-            found = (picture, photo, shared.target(sample, photo))
-            masked = found if counts is None else [pixels * counts.to(picture.device) for pixels in found]
-            rows.append(masked)
-        pictures, photos, wanted = map(list, zip(*rows, strict=True))
-        step_by(training.loss(batch, pictures, wanted), training.run.optimizers)
-        training.after_step(rendered, squared_errors(pictures, photos))
+        drawn, errors = [], []
+
+        def loss_of(part: Batch) -> Tensor:
+            targets = [self._target(sample) for sample in part.samples]
+            rendered, rows = training.render(part), []
+            drawn.append(rendered.kept)
+            for sample, picture, (photo, counts) in zip(
+                part.samples, rendered.pictures, targets, strict=True
+            ):
+                found = (picture, photo, shared.target(sample, photo))
+                rows.append(
+                    found if counts is None else [pixels * counts.to(picture.device) for pixels in found]
+                )
+            pictures, photos, wanted = map(list, zip(*rows, strict=True))
+            errors.extend(squared_errors(pictures, photos))
+            return training.loss(part, pictures, wanted)
+
+        step_by(map(loss_of, training.next_batch().parts()), training.run.optimizers)
+        training.after_step(Rendered.joined(drawn), errors)

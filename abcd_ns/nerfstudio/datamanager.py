@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader
 from abcd_ns.data.dataset import AbcdDataset, has_views
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.events import Event, PhotosWanted
-from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.batch import Batch, Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
@@ -141,6 +141,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         self._coordinator: Trainer | None = None
         self._on_device: dict[tuple[str, int], torch.Tensor] = {}
         self._used = 0
+        self._parts: list[Batch] = []
         # Ours says itself what is wrong with data; what else it ends with is a fault of ours.
         reader = config.reader()
         with nullcontext() if reader_name(reader) == OUR_READER else reading(reader):
@@ -218,8 +219,10 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return kept[crop.slices]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
-        """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""
-        samples = self._coordinator.next_batch()
+        """The next part of a step's batch: its first camera with all of it in the metadata, and the crops of
+        the photos."""
+        self._parts = self._parts or list(self._coordinator.next_batch().parts())
+        samples = self._parts.pop(0)
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
@@ -228,6 +231,11 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         if any(mask is not None for mask in masks):
             batch["mask"] = masks
         return camera, batch
+
+    @property
+    def is_within_step(self) -> bool:
+        """Whether `next_train` will give more of the same step."""
+        return bool(self._parts)
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002
         """A random held-out camera and its whole photo."""

@@ -77,7 +77,7 @@ class AbcdPipeline(VanillaPipeline):
                 check_held_out(sys.argv)
         self.coordinator: Trainer | None = None
         """Drives the training, once it has begun."""
-        self._rendered: Rendered | None = None
+        self._drawn: list[Rendered] = []
         data = self.datamanager.train_dataset
         self.panel = AbcdPanel(self.model, lambda: views_of(data.cameras), lambda row: data.photos.image(row))
 
@@ -116,10 +116,19 @@ class AbcdPipeline(VanillaPipeline):
         ]
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """As VanillaPipeline's, but keeps what the coordinator must be told after the step."""
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        self._rendered, self._errors = outputs.pop("rendered"), outputs.pop("errors")
-        return outputs, losses, metrics
+        """As VanillaPipeline's, of a step's parts in turn; the last one's gradient is left to take.
+        Keeps what the coordinator must be told after the step."""
+        self._errors, earlier = [], 0.0
+        while True:
+            outputs, losses, metrics = super().get_train_loss_dict(step)
+            self._drawn.append(outputs.pop("rendered").kept)
+            self._errors += outputs.pop("errors")
+            if not self.datamanager.is_within_step:
+                metrics["psnr"] = -10 * torch.stack(self._errors).log10().mean()
+                return outputs, {"main_loss": losses["main_loss"] + earlier}, metrics
+            losses["main_loss"].backward()
+            earlier = earlier + losses["main_loss"].detach()
+            del outputs, losses  # before more is drawn
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
@@ -149,9 +158,9 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.take_poses(self.model.poses)
 
     def _after_step(self) -> None:
-        if self._rendered is not None:  # else workers took the step
-            self.coordinator.after_step(self._rendered, self._errors)
-            self._rendered = None
+        if self._drawn:  # else workers took the step
+            self.coordinator.after_step(Rendered.joined(self._drawn), self._errors)
+            self._drawn = []
 
     # -- set-up --------------------------------------------------------------------------------------
 

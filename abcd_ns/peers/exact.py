@@ -138,9 +138,9 @@ class ExactTrainer(Trainer):
         self._residuals = [photo[..., :3] - picture.detach() for picture, photo in pairs]
         return sum(losses[1:], start=losses[0]) / len(losses)
 
-    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:  # noqa: ARG002
         """Pass 2, and a step of every block's optimizers."""
-        gradients, taken = self.gradients(), len(rendered.pictures)
+        gradients, taken = self.gradients(), len(self._batch.samples)
         self.state.step += 1
         owner = self._owner_of_all()
         updated, rows = [], []

@@ -9,6 +9,7 @@ import torch
 
 from abcd_ns.cluster.forked_workers import can_fork
 from abcd_ns.data import DOWNSCALE
+from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
@@ -61,10 +62,10 @@ class Fit:
     """Bytes of the device that training may take."""
     gaussians: int
     """Expected in the whole scene at the end."""
-    batch: int
-    """Views in a step, where there are several blocks."""
     crop_pixels: int = 0
     """Pixels of a view in a step at most; 0 is no limit."""
+    batch: int = 1
+    """Views that are drawn at once, at most; 0 is no limit."""
     pass_gaussians: int = 0
     """Frozen Gaussians that are drawn at once, at most; 0 is as many as usual."""
 
@@ -89,16 +90,8 @@ class Fit:
         if not self.limit:
             grows = "there is no room for the layers of more, and the scene stops growing at that."
         budget = f"{bytes_in_words(self.budget)} of the device allow {limit:,} Gaussians in a block"
-        return f"{budget}: {blocks} to begin with; {grows}{self._drawn_in_words()}"
-
-    def _drawn_in_words(self) -> str:
-        """What a step draws, where it is less than usual."""
-        views = "1 view" if self.batch == 1 else f"{self.batch} views"
-        if self.crop_pixels:
-            return f" Photos are large: a step draws {self.crop_pixels / 1e6:.2g} megapixels of {views}."
-        if self.batch >= views_per_step(0, 2):
-            return ""
-        return f" Photos are large: among several blocks a step draws {views}, not {views_per_step(0, 2)}."
+        parts = f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels."
+        return f"{budget}: {blocks} to begin with; {grows}{parts if self.crop_pixels else ''}"
 
 
 def device_budget(wanted_gb: float, device: torch.device | str) -> int:
@@ -142,18 +135,23 @@ class Demand:
         """The same on smaller photos."""
         return replace(self, pixels=max(self.pixels // times**2, 1), factor=self.factor * times)
 
-    def needs(self, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
-        """What that takes with so many views in a step; see DeviceNeeds."""
-        training, keeps = self.training, not self.on_cpu
-        options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive)
-        return DeviceNeeds(self.pixels, batch, *options)
+    @property
+    def at_once(self) -> int:
+        """Views that are drawn at once: one where nothing is said, for memory is what cuts a scene."""
+        return self.training.limits.batch_limit or 1
+
+    def needs(self, blocks: int, crop_pixels: int, levels: int) -> DeviceNeeds:
+        """What that takes in one block or several; see DeviceNeeds."""
+        training, views = self.training, views_per_step(self.training.batch, blocks)
+        at_once = min(views, self.at_once)
+        options = (training.sh_degree, crop_pixels, levels, not self.on_cpu, training.primitive)
+        return DeviceNeeds(self.pixels, at_once, *options, views - at_once)
 
 
 def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = BUDGET_FLAG) -> Fit:
-    """The fewest blocks whose visits stay within `budget` bytes, on as many views of a step as leave room.
+    """The fewest blocks whose visits stay within `budget` bytes.
 
-    What does not fit is tried with fewer views in a step, unless their number is set, then with parts of a
-    view. A scene that fits in one block needs no room for layers.
+    Where whole views leave no room, steps draw parts. One block needs no room for layers.
 
     Args:
         downscale, memory: the options by which photos are reduced and more memory is given.
@@ -174,24 +172,23 @@ def fit_gaussians(room: int, demand: Demand) -> Fit:
         UserError: they would have next to none.
     """
     training = demand.training
-    views = [views_per_step(training.batch, blocks, training.limits.batch_limit) for blocks in (1, 2)]
-    sole, limit = (room // demand.needs(batch, 0, levels=0).gaussian_bytes for batch in views)
+    sole, limit = (room // demand.needs(blocks, 0, levels=0).gaussian_bytes for blocks in (1, 2))
     if limit < LEAST_LIMIT:
         raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
     blocks, overlap = _fewest(demand.first, limit, sole), training.recipe.overlap
     if overlap > 0:  # an isolated block begins with what lies around its cell, too, and is never cut
         blocks, limit, sole = _fewest(math.ceil((1 + 2 * overlap) ** 2 * demand.first), limit, 0), 0, limit
-    return Fit(blocks, limit, sole, room, demand.gaussians, views[1], pass_gaussians=2 * limit)
+    most = demand.needs(2, 0, levels=0).frozen_beside(limit or sole)
+    return Fit(blocks, limit, sole, room, demand.gaussians, 0, demand.at_once, most)
 
 
 def _fit(budget: int, demand: Demand) -> Fit | None:
     """As `find_fit`; None where nothing fits."""
-    batch, crop = _views_and_crop(budget, demand)
-    # A single block has no neighbours and draws one view a step, so it may be larger.
-    sole_batch = views_per_step(demand.training.batch, 1)
-    sole = demand.needs(sole_batch, crop, levels=0).block_limit(budget)
+    crop = _crop(budget, demand)
+    # A single block has no neighbours, so it may be larger.
+    sole = demand.needs(1, crop, levels=0).block_limit(budget)
     limit, levels = 0, levels_of(2)
-    while (found := demand.needs(batch, crop, levels).block_limit(budget)) >= LEAST_BLOCK:
+    while (found := demand.needs(2, crop, levels).block_limit(budget)) >= LEAST_BLOCK:
         deepest = levels_of(_fewest(demand.gaussians, found, 0))
         if deepest <= levels:
             limit = found
@@ -201,21 +198,18 @@ def _fit(budget: int, demand: Demand) -> Fit | None:
     if not limit and not fits_in_one:
         return None
     blocks = 1 if fits_in_one else _fewest(demand.first, limit, 0)
-    return Fit(blocks, limit, max(sole, 0), budget, demand.gaussians, batch, crop)
+    most = max(demand.needs(2, crop, levels).frozen_beside(limit), LEAST_PASS)
+    return Fit(blocks, limit, max(sole, 0), budget, demand.gaussians, crop, demand.at_once, most)
 
 
-def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
-    """As many views in a step, and as much of them, as leave room for Gaussians."""
-    training, left = demand.training, demand.needs(1, 0, levels_of(2)).left(budget)
-    room = PICTURE_SHARE * left
-    most = views_per_step(training.batch, 2, training.limits.batch_limit)
-    views = [most] if training.batch else [most >> halved for halved in range(most.bit_length())]
-    for batch in views:
-        if demand.needs(batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
-            return batch, training.limits.crop_pixels
-    batch = views[-1]
-    of_a_pixel = DeviceNeeds(1, batch).step_bytes
-    return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
+def _crop(budget: int, demand: Demand) -> int:
+    """As much of a view as leaves room for Gaussians; 0 for all of it."""
+    asked = demand.training.limits.crop_pixels
+    room = PICTURE_SHARE * demand.needs(2, 0, levels_of(2)).left(budget)
+    if asked or demand.needs(2, 0, levels=0).step_bytes <= room:
+        return asked
+    of_a_pixel = DeviceNeeds(1, demand.at_once).step_bytes
+    return min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
 
 
 def _fewest(gaussians: int, limit: int, sole: int) -> int:
@@ -226,11 +220,7 @@ def _fewest(gaussians: int, limit: int, sole: int) -> int:
 def _refusal(budget: int, demand: Demand, downscale: str, memory: str) -> str:
     """Why nothing fits, and which options would help."""
     least = _least_budget(budget, demand)
-    ways = []
-    if demand.training.batch > 1:
-        one = replace(demand, training=replace(demand.training, batch=1))
-        ways += ["one view in a step by --pipeline.training.batch 1"] * (_fit(budget, one) is not None)
-    times = 2
+    ways, times = [], 2
     while times * demand.factor <= MOST_DOWNSCALE and _fit(budget, demand.reduced(times)) is None:
         times *= 2
     if times * demand.factor <= MOST_DOWNSCALE:

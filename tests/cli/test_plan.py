@@ -45,13 +45,13 @@ def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
     found = forecast(
         capture(), Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5), Console(quiet=True)
     )
-    assert found.fit.limits == dict.fromkeys(FITTED, 0) | {"batch_limit": 4}
+    assert found.fit.limits == dict.fromkeys(FITTED, 0)
     assert "1,500,000 Gaussians" in next(iter(found.shares["device"]))
     assert any("on the device" in line for line in found.warnings)
 
 
 def test_workers_for_whom_there_is_no_room_are_refused():
-    alone = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000, batch=4)
+    alone = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000)
     assert blocks_to_begin_with(alone, 0) == 1
     words = r"1\.0 GiB of the device have no room for a block among others"
     with pytest.raises(UserError, match=words) as refused:
@@ -91,7 +91,7 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():
-    fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GIB, gaussians=1000, batch=4)
+    fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GIB, gaussians=1000)
     needs = DeviceNeeds(100, 1)
     shares = shares_of(fit, needs, 0, 1)
     assert sum(shares["disk"].values()) == 1000 * 236 * (2 * 3 + 1)

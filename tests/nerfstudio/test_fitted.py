@@ -12,7 +12,7 @@ from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 
 STEPS = 16
-FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GIB, gaussians=300, batch=2, crop_pixels=600)
+FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GIB, gaussians=300, crop_pixels=600)
 
 
 def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_path, monkeypatch, capsys):
@@ -28,12 +28,12 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
         patched.setattr("abcd_ns.run.begin.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
-    assert "a step draws 0.0006 megapixels of 2 views" in capsys.readouterr().out
+    assert "steps draw parts of 0.0006 megapixels" in capsys.readouterr().out
     with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
         assert {name: store.header[name] for name in FIT.limits} == FIT.limits
     resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
     assert resumed.pipeline.coordinator.config.limits.crop_pixels == 600
-    assert resumed.pipeline.coordinator.batch == 2
+    assert resumed.pipeline.coordinator.config.limits.batch_limit == 1
     assert len(crops) > STEPS
     assert max(crop.pixels for crop in crops) <= 600
     found, expected = gaussians(resumed.base_dir), gaussians(straight.base_dir)

@@ -1,4 +1,4 @@
-"""The number of blocks, the views of a step and what is drawn of them follow from the device's budget; the
+"""The number of blocks and what is drawn of views follow from the device's budget; the
 RAM budget is shared out whole. What that one does to a run is in test_resume.py."""
 
 import dataclasses
@@ -31,15 +31,15 @@ def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = Non
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
-    batch = 1 if blocks == 1 else fit.batch
-    return DeviceNeeds(pixels, batch, crop_pixels=fit.crop_pixels, levels=levels_of(blocks))
+    waiting = 0 if blocks == 1 else 3
+    return DeviceNeeds(pixels, 1, crop_pixels=fit.crop_pixels, levels=levels_of(blocks), waiting=waiting)
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
 @pytest.mark.parametrize("gb", [4, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     fit = fit_for(gb, PIXELS, gaussians)
-    assert (fit.batch, fit.crop_pixels) == (4, 0)
+    assert (fit.batch, fit.crop_pixels) == (1, 0)
     for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
         needs = needs_of(fit, PIXELS, blocks)
         left = needs.left(gb * GIB)
@@ -52,34 +52,25 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
 
 
 @pytest.mark.parametrize(
-    ("gb", "pixels", "batch", "whole"),
+    ("gb", "pixels", "whole"),
     [
-        (4, 2 * MP, 2, True),  # a laptop with 16 GB of RAM
-        (8, 2 * MP, 4, True),
-        (24, 2 * MP, 4, True),
-        (4, 12 * MP, 1, False),
-        (8, 12 * MP, 1, False),
-        (10, 12 * MP, 1, True),
-        (0.9 * 24, 12 * MP, 2, True),
-        (24, 12 * MP, 2, True),
-        (6, GARDEN, 1, False),
-        (8, GARDEN, 1, False),
-        (16, GARDEN, 1, True),
-        (24, GARDEN, 1, True),
-        (28, GARDEN, 2, True),
+        (4, 2 * MP, True),  # a laptop with 16 GB of RAM
+        (8, 12 * MP, False),
+        (10, 12 * MP, True),
+        (8, GARDEN, False),
+        (16, GARDEN, True),
     ],
 )
-def test_large_photos_are_trained_on_by_fewer_views_and_then_by_parts(gb, pixels, batch, whole):
+def test_large_photos_are_trained_on_by_parts(gb, pixels, whole):
     fit = fit_for(gb, pixels)
-    assert (fit.blocks, fit.batch, fit.crop_pixels == 0) == (1, batch, whole)
+    assert (fit.blocks, fit.crop_pixels == 0) == (1, whole)
     assert min(fit.limit, fit.sole) > POINTS
     for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
         needs = needs_of(fit, pixels, blocks)
         assert needs.bytes_for(limit) <= needs.left(int(gb * GIB))
     said = fit.in_words()
     assert "\n" not in said
-    assert ("large" in said) == (batch < 4)
-    assert ("megapixels of 1 view" in said) != whole
+    assert ("parts of" in said) != whole
 
 
 @pytest.mark.parametrize("points", [140_000, 3_000_000])
@@ -88,9 +79,9 @@ def test_with_more_memory_no_less_is_drawn(pixels, points):
     drawn = []
     for gb in (8, 10, 12, 16, 24, 40, 60, 80):
         fit = fit_for(gb, pixels, points)
-        drawn.append(fit.batch * min(fit.crop_pixels or pixels, pixels))
+        drawn.append(min(fit.crop_pixels or pixels, pixels))
     assert drawn == sorted(drawn)
-    assert drawn[-1] == 4 * pixels
+    assert drawn[-1] == pixels
 
 
 def test_a_deep_tree_leaves_less_room_where_photos_are_large():
@@ -122,9 +113,6 @@ def test_a_cpu_keeps_layers_and_photos_under_another_budget():
 
 
 def test_what_is_set_is_kept():
-    assert fit_for(4, 2 * MP, batch=4).batch == 4
-    assert 0 < fit_for(4, 2 * MP, batch=4).crop_pixels < 2 * MP
-    assert fit_for(80, 2 * MP, batch=8).batch == 8
     assert fit_for(80, 2 * MP, crop_pixels=5000).crop_pixels == 5000
     assert fit_for(80, 2 * MP, batch_limit=2).batch == 2
 
@@ -143,7 +131,7 @@ def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
 @pytest.mark.parametrize("pixels", [160 * 106, PIXELS])
 def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixels):
     size = coarse_model_size(TRAINING, block, pixels)
-    visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))
+    visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))  # forced blocks: all at once
     assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
     assert size > block
 
@@ -152,7 +140,7 @@ def test_the_warm_up_has_the_size_that_is_asked_for():
     assert coarse_model_size(training_config(scaffold_gaussians=500), 3_333, PIXELS) == 500
 
 
-@pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch_limit": 1}, {"batch_limit": 1, "crop_pixels": 900}])
+@pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch": 1, "crop_pixels": 900}])
 def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block(fitted):
     assert coarse_model_size(training_config(**fitted), 3_333, PIXELS) == 3_333
 
@@ -174,7 +162,6 @@ def test_a_scene_that_fits_is_one_block():
     [
         (0.1, PIXELS, POINTS, {}),
         (2, GARDEN, 5_000_000, {}),
-        (4, GARDEN, 5_000_000, {"batch": 8}),
         (0.05, 10_000, 50 * LEAST_BLOCK, {}),
     ],
 )
@@ -187,14 +174,12 @@ def test_a_refusal_names_options_that_help(gb, pixels, points, options):
     least = float(re.search(r"--pipeline\.device-budget-gb (\S+),", said)[1])
     assert f"takes {least:.2f} GiB" in said
     assert least > gb
-    assert find_fit(int((least + 0.01) * GIB), demand).batch >= 1
+    assert find_fit(int((least + 0.01) * GIB), demand).blocks >= 1
     with pytest.raises(UserError):
         find_fit(int((least - 0.03) * GIB), demand)
     if factor := re.search(r"--pipeline\.datamanager\.dataparser\.downscale-factor (\d+)", said):
         times = int(factor[1]) // 2
-        assert find_fit(int(gb * GIB), demand.reduced(times)).batch >= 1
-    if "--pipeline.training.batch 1" in said:
-        assert find_fit(int(gb * GIB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
+        assert find_fit(int(gb * GIB), demand.reduced(times)).blocks >= 1
 
 
 @given(st.integers(1, 2**50))

@@ -1,7 +1,7 @@
 """The model of memory, by which blocks are made to fit, against what is live on the simulated device.
 
 Each constant is compared with a slope: what one more pixel, or one more Gaussian, adds to the peak. It must
-be no less than that, and no more than LAVISH times as much, or devices would be left empty. What gsplat's
+be no less than that, and no more than a few times as much, or devices would be left empty. What gsplat's
 kernels take inside, and what an allocator cannot use, is not seen here.
 """
 
@@ -18,7 +18,7 @@ from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
 
-LAVISH = 4.0
+LAVISH, LAVISH_GAUSSIAN = 4.0, 1.5
 GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=2)
 
 
@@ -66,15 +66,16 @@ def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, given):
 GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
 
 
+@pytest.mark.parametrize("batch", [1, 4])
 @pytest.mark.parametrize("given", [{"density": GROWING}, GROWING_SURFELS])
-def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given):
-    options = {"width": 32, "batch": 1, **given}
+def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given, batch):
+    options = {"width": 32, "batch": batch, **given}
     (small, few), (large, many) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
     primitive = given.get("primitive", "3dgs")
-    model = DeviceNeeds(32**2, 1, levels=0, primitive=primitive).gaussian_bytes * (many - few)
-    assert large - small <= model <= LAVISH * (large - small)
+    model = DeviceNeeds(32**2, batch, levels=0, primitive=primitive).gaussian_bytes * (many - few)
+    assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)
 
 
 def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat):

@@ -19,7 +19,7 @@ from abcd_ns.cli.plan.forecast import Forecast, in_words, shares_of, time_steps
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
-from abcd_ns.engine.train.memory import levels_of
+from abcd_ns.engine.train.memory import levels_of, needs_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -137,8 +137,9 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
     counts = owner.bincount(minlength=fit.blocks)
-    batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
-    needs = demand.needs(batch, training.limits.crop_pixels, levels_of(fit.blocks))
+    batch = views_per_step(training.batch, fit.blocks)
+    needs = needs_of(training, pixels, fit.blocks)
+    needs = replace(needs, levels=levels_of(fit.blocks), keeps=not on_cpu)
     fullest = owner == counts.argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
@@ -167,8 +168,7 @@ def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
     """As training has it: blocks whose number is given are as large as they become."""
     if wanted.blocks:
         limits = demand.training.limits
-        batch = views_per_step(demand.training.batch, wanted.blocks, limits.batch_limit)
-        return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, batch, limits.crop_pixels)
+        return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, limits.crop_pixels, limits.batch_limit)
     fit = find_fit(budget, demand, downscale="--downscale", memory="--device-budget-gb")
     return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
 

@@ -84,7 +84,7 @@ class Coordinator(Trainer):
         return self.visit.render(batch)
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """The loss of a step, over what says something about the block."""
+        """What a batch adds to the loss of a step, over what says something about the block."""
         return self.visit.loss(batch, pictures, photos)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:

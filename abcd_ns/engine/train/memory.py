@@ -22,8 +22,12 @@ from abcd_ns.units import bytes_in_words
 
 FLOAT = 4
 """Bytes."""
-PROJECTED_FLOATS = 5.3
-"""Of each row of a Gaussian in one view: itself, copies sorted by tile, the gradients of all these."""
+PROJECTED_FLOATS = 8.2
+"""Of each row of a Gaussian in one view: itself, copies sorted by tile, the gradients of all these, and
+sums of residuals."""
+KEPT_FLOATS = 12
+"""Of a Gaussian in a view that was drawn before the last of its step: a weight, its gradient, and sums of
+residuals."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
@@ -43,7 +47,8 @@ class DeviceNeeds:
 
     Args:
         pixels: of the largest image.
-        batch: views in a step.
+        batch: views that are drawn at once.
+        waiting: other views of a step, at most.
         crop_pixels: of a view that a step trains on at most; 0 is no limit.
         levels: layers of one view that are held, at most, while the blocks around a visited one are folded:
             as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
@@ -59,6 +64,7 @@ class DeviceNeeds:
     levels: int = 2
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
+    waiting: int = 0
 
     @property
     def parameter_bytes(self) -> int:
@@ -67,9 +73,10 @@ class DeviceNeeds:
 
     @property
     def gaussian_bytes(self) -> int:
-        """Of one Gaussian in training: parameters, gradient, two moments; three of them once more while the
-        block is refined; and what its views' drawings hold."""
-        return 7 * self.parameter_bytes + self.batch * projected_bytes(self.primitive)
+        """Of one Gaussian in training: parameters, gradient, two moments, and what its views' drawings hold.
+        Refining takes no more: gradients are gone by then, and one tensor is replaced after the other."""
+        drawn = self.batch * projected_bytes(self.primitive) + self.waiting * KEPT_FLOATS * FLOAT
+        return 4 * self.parameter_bytes + drawn
 
     @property
     def step_bytes(self) -> int:
@@ -80,8 +87,8 @@ class DeviceNeeds:
     @property
     def drawing_bytes(self) -> int:
         """Of whole views while F and B are drawn, which is before the first step: layers while they are
-        folded, views that are being drawn, and the least pass of frozen Gaussians. A larger pass takes no
-        more than gradients and refining of a block of half its size do, which have not begun."""
+        folded, views that are being drawn, and the least pass of frozen Gaussians. For a larger one see
+        `frozen_beside`."""
         if self.levels == 0:
             return 0
         parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
@@ -91,6 +98,12 @@ class DeviceNeeds:
     def _drawn_bytes(self) -> int:
         frozen = LEAST_PASS * self.parameter_bytes + DEVICE_SPLATS * projected_bytes(self.primitive)
         return max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
+
+    def frozen_beside(self, live: int) -> int:
+        """Frozen Gaussians that a pass may draw beside so many live ones: in the room that these have for
+        gradients and for their own drawings, which have not begun."""
+        free = live * (self.gaussian_bytes - 3 * self.parameter_bytes)
+        return free // drawing_bytes(self.sh_degree, self.primitive)
 
     @property
     def parts_bytes(self) -> int:
@@ -138,9 +151,14 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int) -> DeviceNeeds:
     """What a visit takes in a run on images of so many pixels at most, in one block or several."""
-    batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
-    crop, primitive = config.limits.crop_pixels, config.primitive
-    return DeviceNeeds(pixels, batch, config.sh_degree, crop, primitive=primitive)
+    return needs_of_step(config, pixels, views_per_step(config.batch, blocks))
+
+
+def needs_of_step(config: TrainingConfig, pixels: int, views: int) -> DeviceNeeds:
+    """The same where a step has so many views."""
+    at_once, crop = min(views, config.limits.batch_limit or views), config.limits.crop_pixels
+    options = {"primitive": config.primitive, "waiting": views - at_once}
+    return DeviceNeeds(pixels, at_once, config.sh_degree, crop, **options)
 
 
 def levels_of(blocks: int) -> int:
@@ -174,8 +192,8 @@ def projected_bytes(primitive: PrimitiveName) -> int:
 
 def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
     """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
-    wants them, and what one view sees of it."""
-    return 2 * parameter_bytes(sh_degree) + projected_bytes(primitive)
+    wants them, and rows of one view, some of them twice."""
+    return 2 * parameter_bytes(sh_degree) + 2 * PRIMITIVES[primitive].rows * FLOAT
 
 
 def free_bytes(device: torch.device) -> int:

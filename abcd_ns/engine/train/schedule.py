@@ -115,16 +115,15 @@ def plan_epoch(
     return tuple(VisitPlan(b, steps[b], batches.get(b, 0)) for b in order if steps[b] > 0)
 
 
-def views_per_step(batch: int, blocks: int, limit: int = 0, trained: int | None = None) -> int:
+def views_per_step(batch: int, blocks: int, trained: int | None = None) -> int:
     """`TrainingConfig.batch`, its 0 resolved.
 
     Args:
-        limit: `Limits.batch_limit`.
         trained: views that a block was trained on; None for the most that a step draws.
     """
     if batch:
         return batch
-    most = 1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH)
+    most = 1 if blocks == 1 else DEFAULT_BATCH
     return most if trained is None else min(most, 1 << (trained // UNDER_TRAINED).bit_length())
 
 

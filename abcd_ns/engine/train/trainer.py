@@ -38,17 +38,18 @@ class Trainer(ABC):
 
     @abstractmethod
     def render(self, batch: Batch) -> Rendered:
-        """The pictures of a batch, with gradients."""
+        """The pictures of a batch, or of a part of it, with gradients."""
 
     @abstractmethod
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """The loss of a step."""
+        """What a batch adds to the loss of a step."""
 
     @abstractmethod
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped.
 
         Args:
+            rendered: what all parts of the step drew, or what is kept of it.
             errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
 

@@ -1,12 +1,13 @@
 """The plainest caller of a trainer: for tests, benchmarks, and anyone without nerfstudio."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers
 from abcd_ns.engine.render.loss import squared_errors
+from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop
 
@@ -29,19 +30,27 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     if coordinator.trains_elsewhere:
         coordinator.await_step()
         return
-    batch = coordinator.next_batch()
-    read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in batch.samples)
-    photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
-    rendered = coordinator.render(batch)
-    step_by(coordinator.loss(batch, rendered.pictures, photos), coordinator.optimizers)
-    coordinator.after_step(rendered, squared_errors(rendered.pictures, photos))
+    drawn, errors = [], []
+
+    def loss_of(part: Batch) -> Tensor:
+        read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in part.samples)
+        photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
+        rendered = coordinator.render(part)
+        drawn.append(rendered.kept)
+        errors.extend(squared_errors(rendered.pictures, photos))
+        return coordinator.loss(part, rendered.pictures, photos)
+
+    step_by(map(loss_of, coordinator.next_batch().parts()), coordinator.optimizers)
+    coordinator.after_step(Rendered.joined(drawn), errors)
 
 
-def step_by(loss: Float[Tensor, ""], optimizers: Optimizers) -> None:
-    """Take a loss' gradient, if it has one, and step every optimizer."""
+def step_by(losses: Iterable[Float[Tensor, ""]], optimizers: Optimizers) -> None:
+    """Take the gradients of a step's losses, one after the other, and step every optimizer."""
     for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)
-    if loss.requires_grad:
-        loss.backward()
+    for loss in losses:
+        if loss.requires_grad:
+            loss.backward()
+        del loss  # before more is drawn
     for optimizer in optimizers.values():
         optimizer.step()

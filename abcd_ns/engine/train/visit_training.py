@@ -68,10 +68,9 @@ class VisitTraining:
     def batch(self) -> int:
         """Views in a step of the visit that is under way; the most that one draws where none is."""
         config = self.run.config
-        most = views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
+        most = views_per_step(config.batch, self.run.blocks)
         active = self.run.state.active
-        # A run may resume with less memory than its visit began with.
-        return most if active is None else min(active.batch or most, most)
+        return most if active is None else active.batch or most
 
     def attach(self, active: ActiveVisit) -> None:
         """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
@@ -118,7 +117,8 @@ class VisitTraining:
         views = self._views_of(range(first, first + self.batch + COMING))
         run.announce(PhotosWanted(views))
         now = enumerate(views[: self.batch])
-        return Batch(step, tuple(self._sample(view, place, step) for place, view in now))
+        samples = tuple(self._sample(view, place, step) for place, view in now)
+        return Batch(step, samples, run.config.limits.batch_limit)
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
@@ -129,25 +129,27 @@ class VisitTraining:
         return rendered
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """The loss of a step: photometric over what of the crops says something about the block, the mean of
-        the samples', plus what the density strategy adds."""
+        """What a batch adds to the loss of a step: photometric over what of the crops says something about
+        the block, the mean of the samples', plus what the density strategy adds."""
         run = self.run
         pictures, photos = self._visits.compared(batch, pictures, photos)
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
+        self._rendered = None
         losses = batch.losses(pictures, photos, run.config)
         loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
         if run.config.density.strategy == "mcmc":
             loss = loss + run.density.regularisation(run.params, run.count())
-        return loss
+        return loss if batch.share == 1 else loss * batch.share
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
 
         Args:
+            rendered: what all parts of the step drew, or what is kept of it.
             errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
         run, active = self.run, self.run.active
-        taken = len(rendered.pictures)
+        taken = len(rendered.views)
         self._adapt_light(rendered)
         self._note_influence(rendered)
         run.state.step += 1
@@ -155,7 +157,7 @@ class VisitTraining:
         sound, psnr = run.health.end_step(errors)
         self.live.count_step(self.batch, taken)
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
-        judged, self._rendered = self._residuals.found(), None
+        judged = self._residuals.found()
         self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.live.judge()

@@ -20,7 +20,7 @@ from torch import Tensor
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.layer_renderer import default_pass
-from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, needs_of_step
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
@@ -144,7 +144,7 @@ class Training:
         """
         coordinator = self.coordinator
         config, live = coordinator.config, len(coordinator.params["means"])
-        needs = DeviceNeeds(0, coordinator.batch, config.sh_degree, primitive=config.primitive)
+        needs = needs_of_step(config, 0, coordinator.batch)
         held = live * needs.gaussian_bytes
         if drawing:  # parameters and their moments, and of others so many as one pass draws
             most = config.limits.pass_gaussians or default_pass(coordinator.scene)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
@@ -71,15 +72,19 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(mak
     assert stops > 0
 
 
-def test_a_visit_that_goes_on_with_less_memory_draws_no_more_views_than_fit(make):
-    options = {"blocks": 3, "steps": 150, "density": STILL}
-    coordinator = make(**options)
-    coordinator.after_step(coordinator.render(coordinator.next_batch()))
-    assert coordinator.batch == 4
-    stop(coordinator)
-    went_on = make(resume=True, batch_limit=2, **options)
-    assert went_on.run.active.done == 1
-    assert len(went_on.next_batch().samples) == went_on.batch == 2
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos, at_once):
+    options = {"blocks": 3, "steps": 40, "batch": 4, "light": "affine"}
+    together, apart = make("together", **options), make("apart", batch_limit=at_once, **options)
+    parts = [len(part.samples) for part in apart.next_batch().parts()]
+    assert (max(parts), sum(parts)) == (at_once, 4)
+    for coordinator in (together, apart):
+        train(coordinator, photos, steps=12)
+    assert len(together.params["means"]) == len(apart.params["means"])
+    for name, value in together.params.items():
+        assert_close(apart.params[name], value, rtol=1e-3, atol=1e-4)
+    for name, value in together.visit.live.growth.items():
+        assert_close(apart.visit.live.growth[name], value, rtol=1e-3, atol=1e-3)
 
 
 def test_a_queue_of_before_visits_knew_their_batch_is_read():

@@ -69,7 +69,6 @@ def test_the_last_epoch_shares_views_also_where_steps_draw_different_numbers():
 )
 def test_the_steps_of_an_under_trained_block_draw_fewer_views(trained, draws):
     assert views_per_step(0, 8, trained=trained) == draws
-    assert views_per_step(0, 8, limit=2, trained=trained) == min(draws, 2)
     assert views_per_step(3, 8, trained=trained) == 3  # as is asked for
     assert views_per_step(0, 1, trained=trained) == 1
 

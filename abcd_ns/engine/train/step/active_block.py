@@ -103,6 +103,8 @@ class ActiveBlock:
             judged: likewise, see DensityControl.after_step.
         """
         run = self._run
+        for parameter in run.params.values():  # their memory is for what growth takes
+            parameter.grad = None
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, judged, clock)
         if run.density.refines(clock, self.growth):
             self.clocks = replace(self.clocks, refined=clock.steps)

@@ -1,8 +1,9 @@
 """What one step of training is given, and what it draws."""
 
 import random
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.base import Frame
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.render.residual_sums import ResidualSums
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.worth import Judged
@@ -26,6 +28,8 @@ Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 """What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
 Pictures = Sequence[Float[Tensor, "_h _w 3"]]
 """One for each sample of a step, 0..1."""
+KEPT = ("weights", "sums")
+"""Of what a drawing tells, what is read after the step."""
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 COMING = 8
@@ -135,6 +139,17 @@ class Batch:
 
     step: int
     samples: tuple[Sample, ...]
+    at_once: int = 0
+    """Of the samples, so many are drawn at once at most; 0 is no limit."""
+    share: float = 1.0
+    """What it counts for in the step, where it is a part of the step's batch."""
+
+    def parts(self) -> Iterator["Batch"]:
+        """What is drawn one after the other, backward included, so that less memory holds it."""
+        every = self.at_once or len(self.samples)
+        for first in range(0, len(self.samples), every):
+            few = self.samples[first : first + every]
+            yield replace(self, samples=few, share=len(few) / len(self.samples))
 
     def losses(self, pictures: Pictures, photos: Pictures, config: TrainingConfig) -> list[Float[Tensor, ""]]:
         """Of each sample."""
@@ -157,6 +172,18 @@ class Rendered:
     """That the pictures are of."""
 
     @property
+    def kept(self) -> "Rendered":
+        """What `Trainer.after_step` reads of it: neither pictures nor what backward goes through."""
+        infos = tuple({name: info[name] for name in KEPT if name in info} for info in self.infos)
+        return replace(self, pictures=(), rasters=(), infos=infos)
+
+    @staticmethod
+    def joined(parts: Sequence["Rendered"]) -> "Rendered":
+        """Of a step that was drawn in parts."""
+        names = [field.name for field in fields(Rendered)]
+        return Rendered(*(tuple(chain(*(getattr(part, name) for part in parts))) for name in names))
+
+    @property
     def transmittances(self) -> tuple[Float[Tensor, "_h _w"], ...]:
         """Of the rasters."""
         return tuple(raster.transmittance for raster in self.rasters)
@@ -166,7 +193,7 @@ class Residuals:
     """What a step's pictures lack, summed up for each Gaussian by the backward pass: growth judges by it."""
 
     def __init__(self) -> None:
-        self._asked: list[tuple[dict[str, Any], int, Sample, Tensor]] = []
+        self._asked: list[tuple[ResidualSums, int, View, Tensor, float]] = []
 
     @torch.no_grad()
     def ask(
@@ -186,13 +213,13 @@ class Residuals:
             info["sums"].ask([sample.residual(picture, photo) for sample, picture, photo in own])
             for k, (sample, picture, photo) in enumerate(own):
                 error = (photo[..., :3] - picture).square().sum(dim=-1).mean()
-                self._asked.append((info, k, sample, error))
+                self._asked.append((info["sums"], k, sample.view, error, sample.share))
 
     def found(self) -> list[Judged]:
         """After it; then there are none. Nor are there any of a block of nobody."""
         asked, self._asked = self._asked, []
-        known = ((info["sums"].values, *rest) for info, *rest in asked)
-        return [Judged(s.view, sums[k], error, s.share) for sums, k, s, error in known if sums is not None]
+        known = ((sums.values, *rest) for sums, *rest in asked)
+        return [Judged(view, sums[k], *rest) for sums, k, view, *rest in known if sums is not None]
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:
