@@ -94,7 +94,7 @@ class Coordinator(Trainer):
             errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
         if self.poses is not None:
-            self.poses.count(len(rendered.pictures))
+            self.poses.count(len(rendered.views))
         self.visit.after_step(rendered, errors)
         if self.visit.is_over:
             self.end_visit()
