@@ -245,7 +245,7 @@ class AbcdModel(SplatfactoModel):
         if training is not None:
             too_large = training.count() > min(default_pass(self.scene()), self._most_at_once())
         if too_large:
-            return self._by_nodes(view, "fragments").everything()
+            return self._by_nodes(view, "fragments").draw(viewed.Show.EVERYTHING, None)
         gaussians = self._crop(self.merged(self.device).to(self.device))
         return self.draws_with()(gaussians, view, **vars(self._settings()))
 
@@ -253,7 +253,7 @@ class AbcdModel(SplatfactoModel):
     def draw_composited(self, view: View) -> Layer:
         """Each block alone, then folded front to back: what block training composites."""
         pictures = self._by_nodes(view, self.config.ownership, pass_gaussians=0)
-        return pictures.renderer.picture(view, pictures.settings)
+        return pictures.renderer.picture(view, pictures.settings).layer
 
     @torch.no_grad()
     def draw_normals(self, view: View) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
-from abcd_ns.engine.layers.compositing import empty_layer, over
+from abcd_ns.engine.layers.compositing import over
 from abcd_ns.engine.layers.layer_renderer import FrozenLayers, LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.cpu.reference import MIN_TRANSMITTANCE
@@ -107,7 +107,7 @@ class BlockPictures:
         F, B and the composite have no depth: they lie far behind whatever the browser draws over them.
         """
         if show is Show.EVERYTHING or block is None:
-            return self.everything()
+            return self.renderer.picture(self.view, self.settings, MIN_TRANSMITTANCE)
         own = self.renderer.scene.drawn(block, self.renderer.device)
         if show is Show.BLOCK:
             return self._raster(own)
@@ -118,35 +118,13 @@ class BlockPictures:
             return _far_away(over(around.front, over(active.layer, around.back)))
         return _far_away(around.front if show is Show.FRONT else around.back)
 
-    @torch.no_grad()
-    def everything(self) -> Raster:
-        """The whole scene, nearest node first, until nothing behind can be seen."""
-        renderer, view = self.renderer, self.view
-        whole, seen_by = self._nothing(), renderer.frusta([(view, view.full)])
-        for node in renderer.order(renderer.nodes(), view):
-            if float(whole.transmittance.max()) < MIN_TRANSMITTANCE:
-                break
-            loaded, window = renderer.load(node, seen_by=seen_by), None
-            if renderer.ownership == "fragments" and node != 0:
-                window = renderer.span(node, view, view.full)
-            next_one = self._raster(loaded.gaussians, None, window)
-            layer = over(whole.layer, next_one.layer)
-            depth = whole.depth + whole.transmittance * next_one.depth
-            whole = Raster(layer.color, layer.transmittance, depth, {})
-        return whole
-
     def _raster(
         self, gaussians: Gaussians, frozen: Splats | None = None, window: ZWindow | None = None
     ) -> Raster:
         if len(gaussians) == 0 and frozen is None:
-            return self._nothing()
+            return self.renderer.nothing(self.view)
         shot = Shot(self.view, self.view.full, frozen, window)
         return self.renderer.rasterizer.draw(gaussians, [shot], **vars(self.settings))[0]
-
-    def _nothing(self) -> Raster:
-        view = self.view
-        layer = empty_layer(view.height, view.width, self.renderer.device, view.viewmat.dtype)
-        return Raster(layer.color, layer.transmittance, torch.zeros_like(layer.transmittance), {})
 
     def _window(self, own: Gaussians) -> ZWindow | None:
         if self.renderer.ownership == "means":
@@ -159,8 +137,8 @@ class BlockPictures:
         seen_by, seen = renderer.frusta([(view, view.full)]), [Seen(view, view.full, window)]
         parts: dict[int, FrozenLayers | None] = {}
         for node in renderer.nodes(exclude=block):
-            loaded = renderer.load(node, block, seen_by)
-            (parts[node],) = renderer.render(node, loaded, seen, self.settings, active=block)
+            loaded = renderer.load(node, seen_by, exclude=block)
+            (parts[node],) = renderer.render(node, loaded, seen, self.settings, block)
             renderer.fold_up(parts, node, view)
         return renderer.fold(parts, view, view.full)
 

@@ -61,14 +61,6 @@ def test_equals_the_torch_backend(rasterizers, scene, crop, primitive, antialias
         assert relative_error(grads[name], expected_grads[name]) < 1e-2, name
 
 
-@pytest.mark.parametrize("crop", CROPS[1:])
-def test_crop_is_the_crop_of_the_full_image(rasterizer, scene, crop):
-    gaussians = scene(500)
-    full, part = (rasterizer(gaussians, view(), sh_degree=3, crop=c) for c in (None, crop))
-    torch.testing.assert_close(stacked(part), stacked(full)[crop.slices], rtol=1e-4, atol=1e-4)
-    assert torch.equal(part.info["radii"], full.info["radii"])
-
-
 @pytest.mark.parametrize("crop", CROPS)
 def test_sums_of_residuals_and_means2d_gradient(rasterizer, scene, crop):
     infos = []

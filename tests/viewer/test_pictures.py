@@ -58,7 +58,7 @@ def drawn(monkeypatch) -> list[int]:
 
 
 def test_the_device_holds_one_node_at_a_time(drawn):
-    pictures("means").everything()
+    pictures("means").draw(Show.EVERYTHING, None)
     assert len(drawn) == 6
     assert max(drawn) < len(GAUSSIANS) / 4
 

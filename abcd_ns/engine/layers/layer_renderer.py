@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
-from abcd_ns.engine.render import CutShot, Rasterizer, ZWindow
+from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, intersection
 from abcd_ns.engine.space.intervals import ray_interval
@@ -69,12 +69,12 @@ class Loaded:
     """Its own, then those of other nodes that reach into it."""
     own: int
     """How many are its own."""
-    seen: frozenset[int] | None = None
-    """Indices of the views that may see something of the node, or None if that was not asked."""
+    seen: frozenset[int]
+    """Indices of the views that may see something of the node."""
 
     def shows_in(self, view: View) -> bool:
         """Whether `view` may see something of the node; False is certain."""
-        return len(self.gaussians) > 0 and (self.seen is None or view.index in self.seen)
+        return len(self.gaussians) > 0 and view.index in self.seen
 
 
 class LayerRenderer:
@@ -127,7 +127,7 @@ class LayerRenderer:
             node, depth = int(self.tree.parent[node]), depth + 1
         return depth
 
-    def load(self, node: int, exclude: int | None = None, seen_by: Frusta | None = None) -> Loaded:
+    def load(self, node: int, seen_by: Frusta, exclude: int | None = None) -> Loaded:
         """On the device: the Gaussians of the node's blocks and, by fragments, all others that reach in.
 
         Args:
@@ -137,19 +137,17 @@ class LayerRenderer:
         outside: list[int] = []
         if self.ownership == "fragments" and node != 0:
             outside = [b for b in range(self.tree.num_blocks) if b not in set(inside) and b != exclude]
-        seen = None
-        if seen_by is not None:
-            shown = self._shown(node, [*inside, *outside], seen_by)
-            inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
-            seen = frozenset(
-                view.index
-                for k, (view, _) in enumerate(seen_by.seen)
-                if any(row[k] for row in shown.values())
-            )
+        shown = self._shown(node, [*inside, *outside], seen_by)
+        inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
+        views = (view for k, (view, _) in enumerate(seen_by.seen) if any(row[k] for row in shown.values()))
         parts = [self.scene.drawn(block, self.device) for block in inside]
         own, box = sum(map(len, parts)), self.tree.box(node)
         parts += [self.scene.drawn(block, self.device, partial(self._reach, box)) for block in outside]
-        return Loaded(Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device), own, seen)
+        return Loaded(
+            Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device),
+            own,
+            frozenset(view.index for view in views),
+        )
 
     def _shown(self, node: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
         """Of these blocks, those with fragments in the node that some crop may show, and which crops."""
@@ -167,52 +165,51 @@ class LayerRenderer:
         return reaches(means, scales, box, self._optics.slack(means), self._optics.slant)
 
     def render(
-        self,
-        node: int,
-        loaded: Loaded,
-        seen: Sequence[Seen],
-        settings: RenderSettings,
-        *,
-        active: int | None = None,
+        self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings, active: int
     ) -> Iterator[FrozenLayers | None]:
         """Draw a node, loaded by `load`, for each of these views: cut by the window of the active block (by
-        fragments) or put whole before or behind the active block (by means). Without an active block all
-        is in front. None where the view sees nothing of it."""
-        shows = [loaded.shows_in(one.view) for one in seen]
+        fragments) or put whole before or behind the active block (by means). None where the view sees
+        nothing of it."""
+        shown = [one for one in seen if loaded.shows_in(one.view)]
+        if self.ownership == "means":
+            drawn = self._put_whole(node, loaded, shown, settings, active)
+        else:
+            drawn = self._cut(node, loaded, shown, settings)
+        for one in seen:
+            yield next(drawn) if loaded.shows_in(one.view) else None
+
+    def _cut(
+        self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings
+    ) -> Iterator[FrozenLayers]:
+        spans = (self.span(node, one.view, one.crop) for one in seen)
         shots = [
-            self._cut_shot(node, one)
-            for one, shown in zip(seen, shows, strict=True)
-            if shown and one.window is not None
+            CutShot(one.view, one.crop, span.before(one.window), one.window, span.behind(one.window))
+            for one, span in zip(seen, spans, strict=True)
         ]
-        cuts = self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings))
-        for one, shown in zip(seen, shows, strict=True):
-            if not shown:
-                yield None
-            elif one.window is None:
-                yield self._render_whole(node, loaded.gaussians, one, settings, active)
-            else:
-                cut = next(cuts)
-                # What reaches in from another node is inside that one's.
-                others = loaded.own < len(loaded.gaussians)
-                own = cut.inside[torch.where(cut.kept_ids < loaded.own)[0]] if others else cut.inside
-                yield FrozenLayers(cut.front, cut.back, own)
+        others = loaded.own < len(loaded.gaussians)
+        for cut in self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings)):
+            # What reaches in from another node is inside that one's.
+            own = cut.inside[torch.where(cut.kept_ids < loaded.own)[0]] if others else cut.inside
+            yield FrozenLayers(cut.front, cut.back, own)
 
-    def _cut_shot(self, node: int, seen: Seen) -> CutShot:
-        span, window = self.span(node, seen.view, seen.crop), seen.window
-        return CutShot(seen.view, seen.crop, span.before(window), window, span.behind(window))
+    @torch.no_grad()
+    def _put_whole(
+        self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings, active: int
+    ) -> Iterator[FrozenLayers]:
+        for one in seen:
+            layer = self.rasterizer(loaded.gaussians, one.view, crop=one.crop, **vars(settings)).layer
+            nothing = self._nothing(one.view, one.crop)
+            is_front = self.order((node, self.tree.node_of(active)), one.view)[0] == node
+            yield FrozenLayers(layer, nothing) if is_front else FrozenLayers(nothing, layer)
 
-    def _render_whole(
-        self, node: int, gaussians: Gaussians, seen: Seen, settings: RenderSettings, active: int | None
-    ) -> FrozenLayers:
-        by_means = self.ownership == "means"
-        span = None if by_means else self.span(node, seen.view, seen.crop)
-        with torch.no_grad():
-            raster = self.rasterizer(gaussians, seen.view, crop=seen.crop, z_window=span, **vars(settings))
-        layer, nothing = raster.layer, self._nothing(seen.view, seen.crop)
-        front = active is None or not by_means
-        front = front or self.order((node, self.tree.node_of(active)), seen.view)[0] == node
-        return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
+    def raster(self, node: int, gaussians: Gaussians, view: View, settings: RenderSettings) -> Raster:
+        """All that a view sees of a node, by fragments what lies within it; differentiable."""
+        window = None
+        if self.ownership == "fragments" and node:
+            window = self.span(node, view, view.full)
+        return self.rasterizer.draw(gaussians, [Shot(view, view.full, None, window)], **vars(settings))[0]
 
+    @torch.no_grad()
     def span(self, node: int, view: View, crop: Crop) -> ZWindow:
         """Where the rays through the crop's tiles are inside a node."""
         grid = self.rasterizer.window_grid(crop)
@@ -220,6 +217,7 @@ class LayerRenderer:
             return ZWindow.everything(grid, self.device, view.viewmat.dtype)
         return ray_interval(self.tree.box(node), view, grid, self.device)
 
+    @torch.no_grad()
     def order(self, nodes: Sequence[int], view: View) -> tuple[int, ...]:
         """The nodes front to back, as `view` sees them."""
         wanted, center = set(nodes), view.center.double().cpu()
@@ -248,15 +246,26 @@ class LayerRenderer:
         nothing = self._nothing(view, crop)
         return parts[0] or FrozenLayers(nothing, nothing)
 
-    def picture(self, view: View, settings: RenderSettings, crop: Crop | None = None) -> Layer:
-        """The whole scene through layers, node by node: the composited render."""
-        crop = crop or view.full
-        parts: dict[int, FrozenLayers | None] = {}
-        for node in self.nodes():
-            loaded = self.load(node, seen_by=self.frusta([(view, crop)]))
-            (parts[node],) = self.render(node, loaded, [Seen(view, crop)], settings)
-            self.fold_up(parts, node, view)
-        return self.fold(parts, view, crop).front
+    @torch.no_grad()
+    def picture(self, view: View, settings: RenderSettings, stop: float = 0.0) -> Raster:
+        """The whole scene through layers, nearest node first: the composited render. `info` is empty.
+
+        Args:
+            stop: transmittance below which nothing behind is drawn, if no pixel has more.
+        """
+        whole, seen_by = self.nothing(view), self.frusta([(view, view.full)])
+        for node in self.order(self.nodes(), view):
+            if float(whole.transmittance.max()) < stop:
+                break
+            gaussians = self.load(node, seen_by).gaussians
+            if len(gaussians):
+                whole = drawn_over(whole, self.raster(node, gaussians, view, settings))
+        return whole
+
+    def nothing(self, view: View) -> Raster:
+        """A drawing of no Gaussians."""
+        layer = self._nothing(view, view.full)
+        return Raster(layer.color, layer.transmittance, torch.zeros_like(layer.transmittance), {})
 
     def _nothing(self, view: View, crop: Crop) -> Layer:
         return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
@@ -272,6 +281,13 @@ class LayerRenderer:
             return
         yield from self._descend(int(self.tree.left[node]), exclude)
         yield from self._descend(int(self.tree.right[node]), exclude)
+
+
+def drawn_over(front: Raster, behind: Raster) -> Raster:
+    """One drawing of both, depth included."""
+    layer = over(front.layer, behind.layer)
+    depth = torch.addcmul(front.depth, front.transmittance, behind.depth)
+    return Raster(layer.color, layer.transmittance, depth, {})
 
 
 def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:

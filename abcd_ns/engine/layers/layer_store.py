@@ -44,14 +44,9 @@ class Kept:
 
 
 def packed(parts: FrozenLayers) -> Float[Tensor, "2 h w 4"]:
-    """F and B in one tensor, not yet rounded, which lies in memory as the rasterizer's pictures do: they are
-    put together much faster so."""
-    like = parts.front.color
-    height, width, _ = like.shape
-    if like.stride(2) > 1:  # in planes
-        layers = like.new_empty((2, 4, height, width)).permute(0, 2, 3, 1)
-    else:
-        layers = like.new_empty((2, height, width, 4))
+    """F and B in one tensor, not yet rounded."""
+    height, width, _ = parts.front.color.shape
+    layers = parts.front.color.new_empty((2, height, width, 4))
     for into, one in zip(layers, (parts.front, parts.back), strict=True):
         into[..., :3], into[..., 3] = one.color, one.transmittance
     return layers

@@ -94,7 +94,7 @@ def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) 
     for node in renderer.order(renderer.nodes(), view):
         if float(left.max()) <= 0.5:
             break
-        gaussians = renderer.load(node, seen_by=seen_by).gaussians
+        gaussians = renderer.load(node, seen_by).gaussians
         window = renderer.span(node, view, view.full) if node else None
         if len(gaussians):
             left, depth = rasterizer.deepened(

@@ -9,7 +9,6 @@ from torch import Tensor
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.layers.layer_renderer import (
     BYTES_PER_PIXEL,
-    PARTS_BYTES,
     FrozenLayers,
     LayerRenderer,
     RenderSettings,
@@ -43,7 +42,7 @@ class VisitLayers:
         settings: RenderSettings,
         *,
         window_weight: float,
-        parts_bytes: int = PARTS_BYTES,
+        parts_bytes: int,
     ) -> None:
         self._renderer, self._store = renderer, store
         # A copy: whatever becomes of the views, these are drawn.
@@ -54,19 +53,14 @@ class VisitLayers:
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
         self._seen_by = renderer.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
         self._windows: dict[int, ZWindow] = {}
-        self._loaded: dict[int, int] = {}
         self._sum: Tensor | float = 0.0
 
-    def draw(self, views: Iterable[int]) -> Iterator[int]:
-        """Draw F and B of these views and keep what there is room for; yields each view when it is ready.
+    def draw(self, views: Sequence[int]) -> Iterator[Kept]:
+        """Draw F and B of these views and keep what there is room for; yields each when it is ready.
 
         Raises:
             RuntimeError: when all are drawn, if some pixel is NaN or infinite.
         """
-        for view, _ in self._draw(tuple(dict.fromkeys(views))):
-            yield view
-
-    def _draw(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
         for group in self._groups(views):
             yield from self._draw_group(group)
         if not math.isfinite(self._sum):  # the one look at values: a device would be waited for at each
@@ -83,7 +77,7 @@ class VisitLayers:
         crops = [self._geometry.crops[view] for view in views]
         return runs(views, crops, self._parts_bytes // (levels * BYTES_PER_PIXEL))
 
-    def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
+    def _draw_group(self, views: Sequence[int]) -> Iterator[Kept]:
         """All nodes one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         block = self._geometry.block
@@ -92,14 +86,13 @@ class VisitLayers:
         ]
         parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
         for node in self._nodes:
-            loaded = self._renderer.load(node, exclude=block, seen_by=self._seen_by)
-            self._loaded[node] = len(loaded.gaussians)
-            drawn = self._renderer.render(node, loaded, seen, self._settings, active=block)
+            loaded = self._renderer.load(node, self._seen_by, exclude=block)
+            drawn = self._renderer.render(node, loaded, seen, self._settings, block)
             for view, part in zip(views, drawn, strict=True):
                 parts[view][node] = part
                 self._renderer.fold_up(parts[view], node, self._views[view])
                 if node == self._nodes[-1]:
-                    yield view, self._keep(view, parts.pop(view))
+                    yield self._keep(view, parts.pop(view))
 
     def shows(self, view: View) -> bool:
         """Whether this very view is drawn, from where it was when the visit began."""
@@ -111,7 +104,7 @@ class VisitLayers:
         whole = self._geometry.crops[view]
         kept = self._store.get(view)
         if kept is None:  # there was no room for it, or nobody knew that it would be asked for
-            ((_, kept),) = self._draw([view])
+            (kept,) = self.draw([view])
         part = crop or whole
         layers = kept.layers[(slice(None), *part.within(whole).slices)]
         if layers.device.type == "cpu":  # elsewhere what reads them does so

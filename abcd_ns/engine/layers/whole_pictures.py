@@ -9,22 +9,24 @@ fragment that moves over a border is the same in either layer, so that the gradi
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.compositing import empty_layer, fold, sandwich
+from abcd_ns.engine.layers.compositing import fold, sandwich
 from abcd_ns.engine.layers.layer_renderer import (
     BYTES_PER_PIXEL,
     PARTS_BYTES,
     LayerRenderer,
     Loaded,
     RenderSettings,
+    drawn_over,
 )
-from abcd_ns.engine.render import Raster, Shot
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.together import runs
-from abcd_ns.engine.types import Layer, View
+from abcd_ns.engine.types import View
 
 
 class WholePictures:
@@ -104,7 +106,7 @@ class WholePictures:
             raster.color.backward(pull, retain_graph=True)  # views share what leads to the loaded Gaussians
 
     def _load(self, node: int, views: Sequence[View]) -> Loaded:
-        return self._renderer.load(node, seen_by=self._renderer.frusta((still(v), v.full) for v in views))
+        return self._renderer.load(node, self._renderer.frusta((v, v.full) for v in views))
 
     @torch.no_grad()
     def _draw(self, views: Sequence[View]) -> list[dict[int, Raster]]:
@@ -116,23 +118,15 @@ class WholePictures:
                 if loaded.shows_in(view):
                     own[node] = _part(self._raster(node, loaded, view))
         return [
-            {node: own[node] for node in self._renderer.order(tuple(own), still(view))}
+            {node: own[node] for node in self._renderer.order(tuple(own), view)}
             for view, own in zip(views, parts, strict=True)
         ]
 
     def _raster(self, node: int, loaded: Loaded, view: View) -> Raster:
-        window = None
-        if self._renderer.ownership == "fragments" and node:
-            window = self._renderer.span(node, still(view), view.full)
-        shot = Shot(view, view.full, None, window)
-        return self._renderer.rasterizer.draw(loaded.gaussians, [shot], **vars(self._settings))[0]
+        return self._renderer.raster(node, loaded.gaussians, view, self._settings)
 
     def _picture(self, view: View, parts: Mapping[int, Raster]) -> Raster:
-        device, dtype = self._renderer.device, view.viewmat.dtype
-        nothing = empty_layer(view.height, view.width, device, dtype)
-        whole = fold([part.layer for part in parts.values()], like=nothing)
-        depths = [Layer(p.depth[..., None].expand(-1, -1, 3), p.transmittance) for p in parts.values()]
-        return Raster(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0], {})
+        return reduce(drawn_over, parts.values()) if parts else self._renderer.nothing(view)
 
     def _differentiate(
         self, node: int, loaded: Loaded, view: View, parts: Mapping[int, Raster], pull: Tensor
@@ -145,8 +139,3 @@ class WholePictures:
 
 def _part(raster: Raster) -> Raster:
     return Raster(raster.color.detach(), raster.transmittance.detach(), raster.depth.detach(), {})
-
-
-def still(view: View) -> View:
-    """The view with a pose that takes no gradients."""
-    return replace(view, viewmat=view.viewmat.detach())

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -26,9 +26,8 @@ class Raster:
     depth: Float[Tensor, "h w"]
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
-    """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
-    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop. And `sums`, where asked
-    for."""
+    """Of the Gaussians that take gradients, from v cameras: means2d [v, n, 2] and radii [v, n], px of the
+    full image, not of the crop. And `weights` and `sums`, where asked for."""
 
     @property
     def layer(self) -> Layer:
@@ -85,9 +84,8 @@ class Cut:
     """Which of the Gaussians they are."""
 
 
-@runtime_checkable
-class Rasterizer(Protocol):
-    """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera.
+class Rasterizer:
+    """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera; backends derive from it.
 
     Constants (alpha >= 1/255, alpha <= 0.999, stop at T <= 1e-4, 3 sigma radius, 0.3 px blur) are gsplat's.
     """
@@ -110,7 +108,6 @@ class Rasterizer(Protocol):
 
     def warm_up(self) -> None:
         """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""
-        ...
 
     def project(
         self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
@@ -120,7 +117,6 @@ class Rasterizer(Protocol):
         Raises:
             ValueError: `sh_degree` is above what the Gaussians hold.
         """
-        ...
 
     def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
         """Where in each view's image Gaussians may be drawn, on the CPU; see `extents_of`."""
@@ -153,7 +149,6 @@ class Rasterizer(Protocol):
             ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or
                 `sh_degree` is above what the Gaussians hold.
         """
-        ...
 
     def __call__(
         self,
@@ -181,7 +176,6 @@ class Rasterizer(Protocol):
     ) -> Iterator[Cut]:
         """For each shot the fragments in two windows as layers, and what has fragments in a third; no
         gradients. Drawn as they are asked for, a few at a time."""
-        ...
 
     def depth_windows(
         self,
@@ -193,7 +187,6 @@ class Rasterizer(Protocol):
     ) -> Iterator[ZWindow]:
         """For each crop the range of camera z, in each of its tiles, in which the Gaussians show, with
         nothing else in the scene; no gradients. See z_window.showing."""
-        ...
 
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False

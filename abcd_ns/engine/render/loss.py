@@ -105,6 +105,3 @@ def squared_errors(
 ) -> list[Float[Tensor, ""]]:
     """The mean squared error of each pair; see `decibels`."""
     return [F.mse_loss(a, b) for a, b in zip(rendered, photos, strict=True)]
-
-
-# as benchmarks/visit.py calls it

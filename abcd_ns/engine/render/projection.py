@@ -59,12 +59,8 @@ class Splats:
     @property
     def black(self) -> "Splats":
         """The same, which hide what they hid, and show nothing."""
-        return self.colored(torch.zeros_like(self.colors))
-
-    def colored(self, colors: Float[Tensor, "n 3"]) -> "Splats":
-        """The same in other colours."""
         planes = self.planes.clone()
-        planes[-7:-4] = colors.T
+        planes[-7:-4] = 0
         return Splats(planes)
 
     def __getitem__(self, index: Int[Tensor, "m"]) -> "Splats":

@@ -86,20 +86,20 @@ def rasterization(
     gaussians = _before_activation(means, quats, scales, opacities, colors)
     cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
-    shots = [Shot(view, view.full) for view in views]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
-    rasters = _draw(gaussians, shots, absgrad, **options)
+    rasters = _draw(gaussians, views, absgrad, **options)
     color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]
     if "ED" in render_mode:
         depth = depth / alphas.clamp_min(1e-10)
     wanted = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode)
-    return torch.cat(wanted, dim=-1), alphas, rasters[0].info
+    sizes = {"width": width, "height": height, "n_cameras": len(views), "gaussian_ids": None}
+    return torch.cat(wanted, dim=-1), alphas, rasters[0].info | sizes
 
 
-def _draw(gaussians: Gaussians, shots: Sequence[Shot], absgrad: bool, **options: Any) -> tuple[Raster, ...]:
-    rasterizer = rasterizer_on(gaussians.means.device)
+def _draw(gaussians: Gaussians, views: Sequence[View], absgrad: bool, **options: Any) -> tuple[Raster, ...]:
+    rasterizer, shots = rasterizer_on(gaussians.means.device), [Shot(view, view.full) for view in views]
     if not absgrad:
         return rasterizer.draw(gaussians, shots, **options)
     if not isinstance(rasterizer, TorchRasterizer):

@@ -44,7 +44,6 @@ class SumsApart:
         self.values, self._find = None, find  # which holds on to all that was drawn
 
     def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
-        """See ResidualSums."""
         self.values, self._find = self._find(residuals), None
 
 

@@ -8,8 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import (
-    BASES,
-    MAX_SH_DEGREE,
     SH_C0,
     sh_basis_rows,
     sh_degree_of,
@@ -30,13 +28,6 @@ MIN_ALPHA = 1.0 / 255.0
 REACH_MARGIN = 0.01
 """Added to the squared Mahalanobis radius of the bounds, so that rounding never loses a fragment."""
 
-PARAMETERS = 14 + 3 * BASES
-"""Rows that `splat` takes: means x y z, log scales 3, quaternion w x y z, logit of the opacity, spherical
-harmonics of degree 0 (red, green, blue), then of degrees 1 to 3 (red, green, blue of each)."""
-CAMERA = 23 + MAX_SH_DEGREE
-"""Numbers of a camera: world-to-camera rotation 9 and translation 3, fx fy cx cy, width and height, 1 where
-opacities are compensated (antialiased) else 0, camera centre 3, near plane, 1 for each degree of harmonics in
-use."""
 X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE = range(10)
 """Rows that `splat` gives: what is drawn, with gradients,"""
 GRADED = BLUE + 1
@@ -49,6 +40,12 @@ def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float
 
     Colours are max(0, SH(direction) + 0.5), linear, not clamped from above. Covariances come as dot products
     of projected axes: never indefinite, and cheaper. Columns with radius 0 are finite and without meaning.
+
+    Args:
+        parameters: means x y z, log scales 3, quaternion w x y z, logit of the opacity, spherical harmonics
+            of degree 0 (red, green, blue), then of degrees 1 to 3 (red, green, blue of each).
+        camera: world-to-camera rotation 9 and translation 3, fx fy cx cy, width and height, 1 where opacities
+            are compensated (antialiased) else 0, camera centre 3, near plane, 1 for each degree in use.
     """
     *scales, qw, qx, qy, qz, logit = parameters[3:11].unbind(0)
     number = camera.unbind(0)

@@ -61,8 +61,10 @@ class TileGrid:
 
     def pixels(self, device: torch.device | str) -> Int[Tensor, "t"]:
         """How many pixels of the crop each tile holds."""
-        spans = ((self.first_col, self.cols, self.crop.x, self.crop.width),)
-        spans += ((self.first_row, self.rows, self.crop.y, self.crop.height),)
+        spans = (
+            (self.first_col, self.cols, self.crop.x, self.crop.width),
+            (self.first_row, self.rows, self.crop.y, self.crop.height),
+        )
         counts = []
         for first, n, start, size in spans:
             low = torch.arange(first, first + n, device=device) * self.side

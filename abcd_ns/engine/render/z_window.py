@@ -105,8 +105,9 @@ def showing(
     head = so_far[1:] - before.index_select(0, tile)
     tail = after.index_select(0, tile) - so_far[:-1]
     every = visible <= 0
-    near = _extreme(ends, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
-    far = _extreme(ends, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
+    none = z.new_full(ends.shape, math.inf)
+    near = none.scatter_reduce(0, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
+    far = (-none).scatter_reduce(0, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
     held, of_z = ((sums[ends] - sums[starts]).view(crops, tiles) for sums in (so_far, mass))
     return window_between(near.view(crops, tiles), far.view(crops, tiles), held, of_z).to(z)
 
@@ -124,13 +125,6 @@ def window_between(
     last = torch.nextafter(last, torch.full_like(last, math.inf))
     midst = torch.where(held > 0, of_z / held, of_z.sum(1, keepdim=True) / held.sum(1, keepdim=True))
     return torch.where(empty, midst.nan_to_num(0.0).to(near), torch.stack((first, last)))
-
-
-def _extreme(
-    like: Int[Tensor, "t"], tile: Int[Tensor, "q"], z: Float[Tensor, "q"], which: str
-) -> Float[Tensor, "t"]:
-    start = z.new_full(like.shape, math.inf if which == "amin" else -math.inf)
-    return start.scatter_reduce(0, tile, z, which)
 
 
 def _from_zero(values: Float[Tensor, "q"]) -> Float[Tensor, "q+1"]:

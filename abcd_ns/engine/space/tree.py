@@ -32,8 +32,6 @@ class Box:
 
     def grown(self, margin: float) -> "Box":
         """Moved outward by `margin` >= 0 (world units) on every face."""
-        if not margin >= 0:
-            raise ValueError(f"a box cannot grow by {margin}: the margin must be 0 or more")
         return Box(self.lower - margin, self.upper + margin)
 
 
@@ -62,8 +60,6 @@ class BlockTree:
     """The child at and above the threshold; -1 for a leaf."""
     block: Int64[Tensor, "m"]
     """A leaf's block, 0 to num_blocks - 1; -1 for an inner node."""
-    parent: Int64[Tensor, "m"]
-    """-1 for the root."""
 
     def __post_init__(self) -> None:
         if not _is_tree(self):
@@ -86,6 +82,13 @@ class BlockTree:
     @property
     def num_blocks(self) -> int:
         return (self.axis.shape[0] + 1) // 2
+
+    @cached_property
+    def parent(self) -> Int64[Tensor, "m"]:
+        """-1 for the root."""
+        inner, parent = (self.axis >= 0).nonzero()[:, 0], torch.full_like(self.axis, -1)
+        parent[self.left[inner]] = parent[self.right[inner]] = inner
+        return parent
 
     @cached_property
     def _bounds(self) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
@@ -148,15 +151,7 @@ class BlockTree:
         Raises:
             ValueError: no such block or axis, or the plane does not cut the block's cell.
         """
-        node = self.node_of(block)
-        if axis not in (0, 1, 2):
-            raise ValueError(f"there is no axis {axis}: use 0, 1 or 2")
-        lower, upper = (float(bounds[node, axis]) for bounds in self._bounds)
-        if not lower < threshold < upper:
-            raise ValueError(
-                f"block {block} spans {lower} to {upper} on axis {axis}: {threshold} cuts nothing"
-            )
-        rows = self._rows()
+        node, rows = self.node_of(block), self._rows()
         rows[node] = (axis, float(threshold), len(rows), len(rows) + 1, -1)
         return tree_from_rows([*rows, (-1, 0.0, -1, -1, block), (-1, 0.0, -1, -1, self.num_blocks)])
 
@@ -223,15 +218,9 @@ def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...
 
 
 def tree_from_rows(rows: Sequence[Sequence[int | float]]) -> BlockTree:
-    """A tree from (axis, threshold, left, right, block) of each node; parents follow from the children."""
-    parent = [-1] * len(rows)
-    for node, (_, _, *children, _) in enumerate(rows):
-        for child in children:
-            if 0 <= child < len(rows):
-                parent[child] = node
-    axis, threshold, left, right, block = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(dim=1)
-    whole = (column.long() for column in (left, right, block, torch.tensor(parent)))
-    return BlockTree(axis.long(), threshold.clone(), *whole)
+    """A tree from (axis, threshold, left, right, block) of each node."""
+    axis, threshold, *rest = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(dim=1)
+    return BlockTree(axis.long(), threshold.clone(), *(column.long() for column in rest))
 
 
 def _is_row(row: object) -> bool:

@@ -63,8 +63,8 @@ def reaches(
     means: Float[Tensor, "n 3"],
     scales: Float[Tensor, "n 3"],
     box: Box,
-    slack: Float[Tensor, "n"] | float = 0.0,
-    slant: float = 2.0,
+    slack: Float[Tensor, "n"],
+    slant: float,
 ) -> Bool[Tensor, "n"]:
     """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
 
@@ -73,8 +73,7 @@ def reaches(
     Args:
         slack: what the screen adds, world units: its blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a
             tile's diagonal, as a fragment's place is looked up on the ray through the middle of its tile.
-        slant: the largest `widest_slant` of the views in question. 2 covers fields of view up to about
-            90 degrees horizontally by 60 vertically.
+        slant: the largest `widest_slant` of the views in question.
     """
     outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
     return outside.norm(dim=1) <= slant * reach_radius(scales) + slack

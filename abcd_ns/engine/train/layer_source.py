@@ -51,7 +51,7 @@ def layers_of_visit(
         window_weight=config.recipe.window_weight,
         parts_bytes=parts_bytes(run, painted, blocks=2),
     )
-    wanted = dict.fromkeys(views)
+    wanted = tuple(dict.fromkeys(views))
     for done, _ in enumerate(layers.draw(wanted), start=1):
         run.announce(LayersDrawn(active.number, done, len(wanted)))
     return layers

@@ -67,23 +67,3 @@ def test_a_sandwich_is_the_fold_on_the_background(seed, dtype, image):
     torch.testing.assert_close(
         sandwich(front, active, back, background), expected, rtol=0.0, atol=TOLERANCE[dtype]
     )
-
-
-def test_the_sandwich_passes_a_numerical_gradient_check():
-    front, active, back = random_layers(0, 3, torch.float64)
-    background = torch.rand(3, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    inputs = (active.color.requires_grad_(), active.transmittance.requires_grad_())
-    assert torch.autograd.gradcheck(lambda c, t: sandwich(front, Layer(c, t), back, background), inputs)
-
-
-def test_nothing_folds_to_an_empty_layer():
-    like = random_layers(0, 1, torch.float64)[0]
-    folded = fold([], like=like)
-    assert folded.color.dtype == torch.float64
-    assert folded.color.shape == like.color.shape
-    assert bool((folded.color == 0).all() and (folded.transmittance == 1).all())
-
-
-def test_a_background_shows_through_nothing():
-    background = torch.tensor([0.1, 0.5, 0.9])
-    assert torch.equal(composite(empty_layer(2, 5), background), background.expand(2, 5, 3))

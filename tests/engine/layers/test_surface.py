@@ -1,17 +1,18 @@
-"""Normals and median depth of a whole scene, at once and node by node."""
+"""Normals and median depth of a whole scene, at once and node by node; fog."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
-from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
+from abcd_ns.engine.layers.surface import NEARER, colored_by_normal, fog_in_white, median_depth, normals_in
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import View
-from abcd_ns.viewer.pictures import BlockPictures
 from tests.reference.naive_rasterizer import rotation
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -51,7 +52,7 @@ def drawn(primitive: str, view: View, pass_gaussians: int) -> tuple[torch.Tensor
         primitive, pass_gaussians, lambda g: colored_by_normal(g, view, primitive == "2dgs")
     )
     assert (len(renderer.nodes()) == 4) == (pass_gaussians == 0)
-    return depth, normals_in(BlockPictures(renderer, view, SETTINGS).everything())
+    return depth, normals_in(renderer.picture(view, SETTINGS))
 
 
 @PRIMITIVES
@@ -75,9 +76,17 @@ def test_both_are_those_of_a_loop_over_fragments(primitive):
     assert crossed >= 2
 
 
-@PRIMITIVES
-def test_nodes_give_what_all_at_once_gives(primitive):
-    for view in VIEWS:
-        whole, parts = (median_depth(renderer_of(primitive, n), view, SETTINGS) for n in (1000, 0))
-        assert torch.allclose(whole, parts, atol=1e-9)
-        assert float((whole > 0).double().mean()) > 0.2
+def test_fog_is_the_weight_of_what_lies_before_the_nearest_point():
+    def share(gaussians, view):
+        return float(draw(fog_in_white(gaussians, view), view, sh_degree=0).color.mean())
+
+    draw, view = TorchRasterizer(), VIEWS[0]
+    z = SCENE.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    nearest = float(z.median()) / NEARER
+    fog = SCENE[z < NEARER * nearest]
+    alone = 1 - float(draw(fog, view, sh_degree=0).transmittance.mean())  # nothing lies before it
+    assert alone > 0.02
+    assert share(SCENE, replace(view, nearest=nearest)) == pytest.approx(alone, abs=1e-5)
+    assert share(SCENE, view) < 1e-6  # a view that knows no point has none
+    behind = replace(SCENE, means=(view.center - view.viewmat[2, :3]).expand(60, 3))
+    assert share(behind, replace(view, nearest=1.0)) < 1e-6

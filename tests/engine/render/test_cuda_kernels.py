@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 
 import pytest
 import torch
@@ -132,24 +131,12 @@ def failing(error):
     return Fused("The loss", fail)
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        RuntimeError("no compiler"),
-        ImportError("triton"),
-        OSError("no room"),
-        subprocess.CalledProcessError(1, "gcc"),  # it finds no Python.h
-        AssertionError("libcuda.so cannot found"),
-        type("PTXASError", (Exception,), {})("no such GPU"),
-    ],
-)
-def test_where_they_do_not_it_is_said_once(error):
+@pytest.mark.parametrize("error", [RuntimeError("no compiler"), subprocess.CalledProcessError(1, "gcc")])
+def test_where_they_do_not_compile_it_is_said_once(error):
     fused = failing(error)
     with pytest.warns(UserWarning, match=f"The loss runs uncompiled.*{re.escape(str(error))}"):
         assert fused(ON_CUDA, ON_CUDA, 0.5, 0.5) is None
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert fused(ON_CUDA, ON_CUDA, 0.5, 0.5) is None
+    assert fused(ON_CUDA, ON_CUDA, 0.5, 0.5) is None  # without another warning: tests take them for errors
 
 
 @pytest.mark.parametrize(
@@ -162,24 +149,12 @@ def test_a_fault_of_the_device_is_not_taken_for_that(error):
 
 
 def test_what_has_run_compiles():
-    answers = iter([None, ZeroDivisionError("a fault of our own")])
-
-    def run(*_):
-        answer = next(answers)
-        if answer is not None:
-            raise answer
-        return "found"
-
-    fused = Fused("The loss", run)
+    answers = iter([lambda: "found", lambda: 1 / 0])
+    fused = Fused("The loss", lambda *_: next(answers)())
     assert not fused.runs
-    assert fused(ON_CUDA, ON_CUDA) == "found"
+    assert fused(torch.zeros(4)) is None  # they are for single floats on CUDA
+    assert fused(DOUBLE) is None
+    assert fused(ON_CUDA) == "found"
     assert fused.runs
     with pytest.raises(ZeroDivisionError):
-        fused(ON_CUDA, ON_CUDA)
-
-
-def test_they_are_for_single_floats_on_cuda():
-    fused = Fused("The loss", lambda rendered, photo, *_: (rendered, photo))
-    assert fused(ON_CUDA, ON_CUDA, 0.5, 0.25) is not None
-    assert fused(torch.zeros(4), torch.zeros(4), 0.5, 0.5) is None
-    assert fused(DOUBLE, DOUBLE, 0.5, 0.5) is None
+        fused(ON_CUDA)

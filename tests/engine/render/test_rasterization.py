@@ -49,9 +49,8 @@ def as_raster(gaussians: Gaussians, view: View, **options) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("sh_degree", "mode"), [(None, "classic"), (0, "antialiased"), (3, "classic")])
-@pytest.mark.parametrize("view", VIEWS, ids=["turned", "straight"])
-def test_picture_and_gradient_equal_the_naive_twins(view, sh_degree, mode):
-    gaussians = random_gaussians(12)
+def test_picture_and_gradient_equal_the_naive_twins(sh_degree, mode):
+    gaussians, view = random_gaussians(12), VIEWS[0]
     options = {"sh_degree": sh_degree or 0, "antialiased": mode == "antialiased"}
     expected, expected_grads = gradients(lambda g: naive_rasterize(g, view, **options), gaussians)
     found, grads = gradients(
@@ -62,18 +61,19 @@ def test_picture_and_gradient_equal_the_naive_twins(view, sh_degree, mode):
         assert relative_error(grads[name], expected_grads[name]) < 1e-9, name
 
 
-@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
-def test_every_mode_draws_all_cameras_on_their_backgrounds(mode):
+def test_every_mode_draws_all_cameras_on_their_backgrounds():
     gaussians, grounds = random_gaussians(12), torch.rand(2, 3, dtype=torch.float64)
-    pictures, alphas, meta = drawn(gaussians, render_mode=mode, backgrounds=grounds)
-    for k, view in enumerate(VIEWS):
-        naive = naive_rasterize(gaussians, view, sh_degree=2)
-        color = naive.color + naive.transmittance[..., None] * grounds[k]
-        depth = naive.depth / (1 - naive.transmittance).clamp_min(1e-10) if "ED" in mode else naive.depth
-        parts = [color] * ("RGB" in mode) + [depth[..., None]] * ("D" in mode)
-        torch.testing.assert_close(pictures[k], torch.cat(parts, dim=-1), rtol=1e-9, atol=1e-10)
-        torch.testing.assert_close(alphas[k, ..., 0], 1 - naive.transmittance, rtol=1e-10, atol=1e-11)
-        assert meta["radii"][k].tolist() == naive.radii
+    naives = [naive_rasterize(gaussians, view, sh_degree=2) for view in VIEWS]
+    for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        pictures, alphas, meta = drawn(gaussians, render_mode=mode, backgrounds=grounds)
+        for k, naive in enumerate(naives):
+            alpha = 1 - naive.transmittance
+            color = naive.color + naive.transmittance[..., None] * grounds[k]
+            depth = naive.depth / alpha.clamp_min(1e-10) if "ED" in mode else naive.depth
+            parts = [color] * ("RGB" in mode) + [depth[..., None]] * ("D" in mode)
+            torch.testing.assert_close(pictures[k], torch.cat(parts, dim=-1), rtol=1e-9, atol=1e-10)
+            torch.testing.assert_close(alphas[k, ..., 0], alpha, rtol=1e-10, atol=1e-11)
+            assert meta["radii"][k].tolist() == naive.radii
     assert (meta["width"], meta["height"], meta["n_cameras"]) == (VIEWS[0].width, VIEWS[0].height, 2)
 
 
@@ -145,12 +145,6 @@ def test_absolute_gradients_are_sums_over_pixels():
         expected += one["means2d"].grad.abs()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
     assert (found > meta["means2d"].grad.abs() - 1e-4).all()
-
-
-def test_surfels_have_no_absolute_gradients():
-    gaussians, view = random_gaussians(3).to(torch.float32), small_view(19, 11, torch.float32)
-    with pytest.raises(ValueError, match="absgrad=True is not supported here"):
-        TorchRasterizer(primitive="2dgs").draw(gaussians, [Shot(view, view.full)], sh_degree=0, absgrad=True)
 
 
 def test_what_is_frozen_in_another_precision_is_drawn_as_what_it_is():

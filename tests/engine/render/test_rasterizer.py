@@ -49,11 +49,9 @@ def by_pixel(window: ZWindow) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("sh_degree", "antialiased", "crop", "with_frozen", "windowed"),
     [
-        (0, False, None, False, False),
         (1, True, None, False, False),
-        (2, False, CROP, False, False),
-        (3, False, None, True, False),
-        (3, True, CROP, False, True),
+        (0, False, None, True, False),
+        (2, True, CROP, False, True),
         (3, False, CROP, True, True),
     ],
 )
@@ -85,31 +83,29 @@ def test_scene_has_what_the_tests_are_about():
     torch.testing.assert_close(stacked(expected), stacked(dense), rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("side", [1, 2, 8, 16])
-def test_tile_size_does_not_matter(side):
-    draws = (EAGER, TorchRasterizer(use_native=False, tile_side=side))
+def test_tile_size_does_not_matter():
+    draws = (EAGER, TorchRasterizer(use_native=False, tile_side=16))
     found = (partial(draw, view=VIEW, sh_degree=2) for draw in draws)
     assert_drawn_alike(*found, random_gaussians(40), 1e-13, 1e-11)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("draw", [EAGER, TorchRasterizer()], ids=["torch", "native"])
 @given(data=st.data())
-@settings(max_examples=12, derandomize=True, deadline=None)
-def test_crop_is_bit_equal_to_the_crop_of_the_full_image(dtype, data):
-    view = small_view(53, 41, dtype=dtype)
-    gaussians = random_gaussians(150, seed=1, sh_degree=1, dtype=dtype)
+@settings(max_examples=12)
+def test_crop_is_bit_equal_to_the_crop_of_the_full_image(draw, data):
+    view = small_view(53, 41, dtype=torch.float32)
+    gaussians = random_gaussians(150, seed=1, sh_degree=1, dtype=torch.float32)
     x, y = data.draw(st.integers(0, 52)), data.draw(st.integers(0, 40))
     crop = Crop(x, y, data.draw(st.integers(1, 53 - x)), data.draw(st.integers(1, 41 - y)))
-    full = EAGER(gaussians, view, sh_degree=1)
-    part = EAGER(gaussians, view, sh_degree=1, crop=crop)
+    full = draw(gaussians, view, sh_degree=1)
+    part = draw(gaussians, view, sh_degree=1, crop=crop)
     assert torch.equal(stacked(part), stacked(full)[crop.slices])
     assert torch.equal(part.info["radii"], full.info["radii"])
 
 
-@pytest.mark.parametrize("with_frozen", [False, True])
-def test_residuals_are_summed_by_weight_and_place(with_frozen):
+def test_residuals_are_summed_by_weight_and_place():
     """A loop over pixels, in which a weight is the gradient of the picture by a colour."""
-    gaussians, frozen = random_gaussians(6), random_gaussians(5, seed=7) if with_frozen else None
+    gaussians, frozen = random_gaussians(6), random_gaussians(5, seed=7)
     crop = Crop(9, 5, 12, 8)
     residual = probe(crop.height, crop.width)[..., :4]
     dark = replace(gaussians, features_dc=torch.zeros_like(gaussians.features_dc).requires_grad_())
@@ -123,7 +119,7 @@ def test_residuals_are_summed_by_weight_and_place(with_frozen):
             (residual[y, x, 3:].expand(6, 1), r.expand(6, 3), place[:, :1] * r, place[:, 1:] * r), dim=1
         )
 
-    shot = Shot(VIEW, crop, None if frozen is None else EAGER.project(frozen, VIEW, sh_degree=0))
+    shot = Shot(VIEW, crop, EAGER.project(frozen, VIEW))
     (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1, judge=True)
     raster.info["sums"].ask([residual])
     raster.color.sum().backward()
@@ -131,11 +127,10 @@ def test_residuals_are_summed_by_weight_and_place(with_frozen):
     assert relative_error(raster.info["sums"].values[0], expected) < 1e-9
 
 
-@pytest.mark.parametrize("with_frozen", [False, True])
-def test_weighing_adds_up_what_gaussians_fill_and_changes_nothing_else(with_frozen):
+def test_weighing_adds_up_what_gaussians_fill_and_changes_nothing_else():
     """A weight is the gradient of the picture's sum by the colour, for which the naive twin is asked."""
-    gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7) if with_frozen else None
-    shot = Shot(VIEW, CROP, None if frozen is None else EAGER.project(frozen, VIEW, sh_degree=0))
+    gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7)
+    shot = Shot(VIEW, CROP, EAGER.project(frozen, VIEW))
     counts = probe(CROP.height, CROP.width)[..., 0]
     dark = replace(gaussians, features_dc=torch.zeros_like(gaussians.features_dc).requires_grad_())
     naive = naive_rasterize(dark, VIEW, sh_degree=0, crop=CROP, frozen=frozen)
@@ -173,7 +168,6 @@ def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
     assert relative_error(info["means2d"].grad[0], expected) < 1e-10
     assert info["radii"].shape == (1, 12)
     assert info["radii"][0].tolist() == naive.radii
-    assert (info["width"], info["height"], info["n_cameras"]) == (37, 21, 1)
 
 
 @pytest.mark.parametrize("with_frozen", [False, True])
@@ -223,18 +217,10 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index():
     assert swapped[10, 18, 1] > swapped[10, 18, 0]
 
 
-def test_nothing_is_saved_without_gradients():
-    with torch.autograd.graph.saved_tensors_hooks(lambda _: pytest.fail("saved a tensor"), lambda x: x):
-        raster = EAGER(random_gaussians(20), VIEW, sh_degree=3)
-    assert not raster.color.requires_grad
-
-
 def test_clear_errors():
     gaussians = random_gaussians(3, sh_degree=1)
     with pytest.raises(ValueError, match="sh_degree is 2"):
         EAGER(gaussians, VIEW, sh_degree=2)
-    with pytest.raises(ValueError, match="tile_side is 5"):
-        TorchRasterizer(tile_side=5)
     for grid in (TileGrid(CROP, 4), TileGrid(VIEW.full, 2)):
         with pytest.raises(ValueError, match="a window on"):
             EAGER(gaussians, VIEW, sh_degree=0, z_window=window_for(grid))

@@ -1,7 +1,6 @@
 """gsplat's reference against the torch rasterizer, and the gsplat backend's own logic with CPU stand-ins."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.rasterizer_scenes import (
     as_leaves,
-    assert_drawn_alike,
     probe,
     project,
     random_gaussians,
@@ -59,7 +57,7 @@ def test_projection_equals_gsplats(antialiased):
         assert relative_error(value, reference) < 1e-8, name
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_colours_equal_gsplats(degree):
     ours, theirs = as_leaves(random_gaussians(60)), as_leaves(random_gaussians(60))
     used = (degree + 1) ** 2
@@ -94,84 +92,20 @@ def torch_twin(backend: GsplatRasterizer, side: int = 4) -> TorchRasterizer:
     return TorchRasterizer(use_native=False, tile_side=side, primitive=backend.primitive.name)
 
 
-@pytest.mark.parametrize(
-    ("crop", "with_frozen", "antialiased", "sh_degree"),
-    [(None, False, True, 3), (Crop(16, 16, 40, 20), False, False, 0), (Crop(19, 5, 30, 31), True, False, 2)],
-)
-def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_degree):
-    gaussians, frozen = random_gaussians(40), random_gaussians(15, seed=3) if with_frozen else None
-    options = {"crop": crop, "frozen": frozen, "antialiased": antialiased, "sh_degree": sh_degree}
-    draws = (partial(draw, view=VIEW, **options) for draw in (backend, torch_twin(backend)))
-    assert_drawn_alike(*draws, gaussians, 1e-9, 1e-8)
-
-
 @pytest.mark.parametrize("backend", ["3dgs"], indirect=True)  # gsplat gives surfels' cameras no gradient
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_the_gradient_of_a_pose_equals_the_torch_backends(backend, antialiased):
+def test_the_gradient_of_a_pose_equals_the_torch_backends(backend):
     gaussians, found = random_gaussians(40), []
     for draw in (backend, torch_twin(backend)):
         seen = replace(VIEW, viewmat=VIEW.viewmat.clone().requires_grad_())
         for _ in range(2):  # the second time, nothing is taken from what was kept
-            picture = stacked(draw(gaussians, seen, sh_degree=3, antialiased=antialiased))
+            picture = stacked(draw(gaussians, seen, sh_degree=3, antialiased=True))
             (picture * probe(*picture.shape[:2])).sum().backward()
         found.append(seen.viewmat.grad)
     assert relative_error(*found) < 1e-8
 
 
-def test_the_near_plane_is_the_views(backend):
-    gaussians = random_gaussians(40)
-    near = 1.001 * float(backend.project(gaussians, VIEW).depths.median())
-    cut = replace(VIEW, near=near)
-    found, expected = (draw(gaussians, cut, sh_degree=0).color for draw in (backend, torch_twin(backend)))
-    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
-    assert not torch.allclose(found, backend(gaussians, VIEW, sh_degree=0).color)
-
-
-@pytest.mark.parametrize("crop", [None, Crop(19, 5, 30, 31)])
-@pytest.mark.parametrize("with_frozen", [False, True])
-def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
-    frozen = random_gaussians(15, seed=3) if with_frozen else None
-    infos, options = [], {"crop": crop, "frozen": frozen, "judge": True, "sh_degree": 0}
-    for draw in (backend, torch_twin(backend)):
-        raster = draw(as_leaves(random_gaussians(40)), VIEW, **options)
-        weights = probe(*raster.transmittance.shape)
-        raster.info["means2d"].retain_grad()
-        raster.info["sums"].ask([weights[..., :4]])
-        (stacked(raster) * weights).sum().backward()
-        infos.append(raster.info)
-    info, expected = infos
-    assert torch.equal(info["radii"], expected["radii"])
-    assert relative_error(info["means2d"].grad, expected["means2d"].grad) < 1e-8
-    assert relative_error(info["sums"].values, expected["sums"].values) < 1e-8
-    assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
-
-
-@pytest.mark.parametrize("with_frozen", [False, True])
-def test_weights_are_those_of_the_torch_backend(backend, with_frozen):
-    frozen, found = random_gaussians(15, seed=3) if with_frozen else None, []
-    for rasterizer in (backend, torch_twin(backend)):
-        seen = None if frozen is None else rasterizer.project(frozen, VIEW)
-        leaves, shot = as_leaves(random_gaussians(40)), Shot(VIEW, Crop(19, 5, 30, 31), seen)
-        (raster,) = rasterizer.draw(leaves, [shot], sh_degree=0, blend_weights=True)
-        (raster.color.square().sum() + (raster.depth * probe(31, 30)[..., 0]).sum()).backward()
-        found.append((raster.info["weights"].grad, leaves.means.grad, raster.depth))
-    assert float(found[1][0].abs().max()) > 1
-    assert relative_error(found[0][0], found[1][0]) < 1e-8
-    assert relative_error(found[0][1], found[1][1]) < 1e-8
-    assert bool((found[0][2] == 0).all())
-
-
-def test_nothing_to_draw(backend):
-    raster = backend(
-        as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4)
-    )
-    raster.info["means2d"].retain_grad()
-    assert raster.color.shape == (4, 5, 3)
-    assert (raster.transmittance == 1).all()
-    assert raster.info["means2d"].shape == (1, 0, 2)
-
-
 def test_self_check_accepts_it(backend):
+    """Which compares single shots in every way that training asks for."""
     assert 0 < self_check(backend, "cpu") < (1e-4 if backend.primitive.name == "3dgs" else 5e-4)
 
 
@@ -179,25 +113,6 @@ def window_for(crop: Crop, seed: int = 3) -> ZWindow:
     grid, generator = TileGrid(crop, TILE), torch.Generator().manual_seed(seed)
     near, size = torch.rand(2, grid.tiles, generator=generator, dtype=torch.float64)
     return ZWindow(grid, 4 * near + 1, 4 * near + 1 + 3 * size)
-
-
-@pytest.mark.parametrize("with_frozen", [False, True])
-@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
-def test_a_z_window_is_that_of_the_torch_backend(backend, crop, with_frozen):
-    gaussians, frozen = random_gaussians(40), random_gaussians(30, seed=3) if with_frozen else None
-    options = {"crop": crop, "frozen": frozen, "sh_degree": 1, "z_window": window_for(crop)}
-    draws = (partial(draw, view=VIEW, **options) for draw in (backend, torch_twin(backend, TILE)))
-    assert_drawn_alike(*draws, gaussians, 1e-9, 1e-8)
-
-
-def test_a_window_masks_what_is_frozen_where_anything_is(backend):
-    """An empty window takes everything away, but for the Gaussians that take gradients beside frozen ones."""
-    gaussians, frozen, window = random_gaussians(9), random_gaussians(9, seed=3), window_for(VIEW.full)
-    nothing = replace(window, far=window.near)
-    alone = backend(gaussians, VIEW, sh_degree=0, z_window=nothing)
-    beside = backend(gaussians, VIEW, sh_degree=0, frozen=frozen, z_window=nothing)
-    assert bool((alone.transmittance == 1).all())
-    assert torch.equal(stacked(beside), stacked(backend(gaussians, VIEW, sh_degree=0)))
 
 
 def moved(view: View, by: float = 0.0, **changes) -> View:
@@ -224,8 +139,7 @@ def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
     return shots
 
 
-@pytest.mark.parametrize("windowed", [False, True])
-@pytest.mark.parametrize("with_frozen", [False, True])
+@pytest.mark.parametrize(("windowed", "with_frozen"), [(False, False), (True, False), (True, True)])
 def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, windowed, with_frozen):
     found = []
     for draws in (backend, torch_twin(backend, TILE)):
@@ -233,7 +147,6 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
         shots = several_shots(torch_twin(backend, TILE), windowed, with_frozen)
         rasters = draws.draw(leaves, shots, sh_degree=2, judge=True)
         infos = {id(raster.info): raster.info for raster in rasters}
-        assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
         for info in infos.values():
             info["means2d"].retain_grad()
             own = [r for r in rasters if r.info is info]
@@ -247,6 +160,7 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
         values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
         values |= {name: value.grad for name, value in leaves.items()}
         values["means2d"] = torch.cat([info["means2d"].grad for info in infos.values()])[place]
+        values["radii"] = torch.cat([info["radii"] for info in infos.values()])[place].double()
         values["sums"] = torch.cat([info["sums"].values for info in infos.values()])[place]
         found.append(values)
     for name, value in found[0].items():
@@ -266,58 +180,33 @@ def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
     assert bool((nobody[:, :2] > nobody[:, 2:]).all())
 
 
-@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
-def test_cut_is_that_of_the_torch_backend(backend, crop):
-    gaussians, inside = random_gaussians(60), window_for(crop)
-    span = ZWindow.everything(inside.grid, "cpu", torch.float64)
-    shot = CutShot(VIEW, crop, span.before(inside), inside, span.behind(inside))
-    found, expected = (
-        next(draw.cuts(gaussians, [shot], sh_degree=1)) for draw in (backend, torch_twin(backend, TILE))
-    )
-    for side in ("front", "back"):
-        one, other = getattr(found, side), getattr(expected, side)
-        torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
-        torch.testing.assert_close(one.transmittance, other.transmittance, rtol=1e-9, atol=1e-10)
-    # gsplat's lists are longer: they hold what the square of the radius touches, drawn there or not.
-    assert set(expected.kept_ids.tolist()) <= set(found.kept_ids.tolist())
-    assert torch.equal(found.kept_ids, found.kept_ids.unique())
-    torch.testing.assert_close(found.inside.depths, backend.project(gaussians, VIEW).depths[found.kept_ids])
-
-
-@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
-@pytest.mark.parametrize("visible", [0.06, 0.3])
-def test_the_depth_window_is_that_of_the_torch_backend(backend, crop, visible):
-    gaussians = random_gaussians(30)
-    draws = (backend, torch_twin(backend, TILE))
-    found, expected = (draw.depth_window(gaussians, VIEW, crop=crop, visible=visible) for draw in draws)
-    assert found.grid == expected.grid
-    torch.testing.assert_close(found.near, expected.near)
-    torch.testing.assert_close(found.far, expected.far)
-
-
-def test_depth_windows_and_cuts_of_several_views_are_those_of_each(backend):
-    gaussians, shots = random_gaussians(60), []
+def test_depth_windows_and_cuts_of_several_views_are_the_torch_backends(backend):
+    gaussians, draws = random_gaussians(60), (backend, torch_twin(backend, TILE))
     seen = [
         (VIEW, VIEW.full),
         (moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
         (moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
     ]
-    for (view, crop), window in zip(seen, backend.depth_windows(gaussians, seen, visible=0.1), strict=True):
-        alone = backend.depth_window(gaussians, view, crop=crop, visible=0.1)
-        assert window.grid == alone.grid
-        torch.testing.assert_close((window.near, window.far), (alone.near, alone.far))
+    windows = (draw.depth_windows(gaussians, seen, visible=0.1) for draw in draws)
+    for found, expected in zip(*windows, strict=True):
+        assert found.grid == expected.grid
+        torch.testing.assert_close((found.near, found.far), (expected.near, expected.far))
+    shots = []
+    for view, crop in seen:
         window = window_for(crop)
         every = ZWindow.everything(window.grid, "cpu", torch.float64)
         shots.append(CutShot(view, crop, every.before(window), window, every.behind(window)))
-    for cut, shot in zip(backend.cuts(gaussians, shots, sh_degree=1), shots, strict=True):
-        (alone,) = backend.cuts(gaussians, [shot], sh_degree=1)
-        assert torch.equal(cut.kept_ids, alone.kept_ids)
-        for layer in ("front", "back"):
-            found, expected = getattr(cut, layer), getattr(alone, layer)
-            torch.testing.assert_close(found.color, expected.color)
-            torch.testing.assert_close(found.transmittance, expected.transmittance)
-        # Rows that gsplat leaves as they were are not drawn.
-        torch.testing.assert_close(cut.inside.planes[:-4], alone.inside.planes[:-4])
+    cuts = (draw.cuts(gaussians, shots, sh_degree=1) for draw in draws)
+    for found, expected, (view, _) in zip(*cuts, seen, strict=True):
+        for side in ("front", "back"):
+            one, other = getattr(found, side), getattr(expected, side)
+            torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
+            torch.testing.assert_close(one.transmittance, other.transmittance, rtol=1e-9, atol=1e-10)
+        # gsplat's lists are longer: they hold what the square of the radius touches, drawn there or not.
+        assert set(expected.kept_ids.tolist()) <= set(found.kept_ids.tolist())
+        assert torch.equal(found.kept_ids, found.kept_ids.unique())
+        depths = backend.project(gaussians, view).depths[found.kept_ids]
+        torch.testing.assert_close(found.inside.depths, depths)
 
 
 def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
@@ -329,5 +218,7 @@ def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
     rasters = backend.draw(leaves, shots, sh_degree=3, judge=True)
     sum(stacked(raster).sum() for raster in rasters).backward()
+    assert bool((rasters[0].transmittance == 1).all())
+    assert rasters[0].info["means2d"].shape == (2, 0, 2)
     assert leaves.means.grad.shape == (0, 3)
     assert "sums" not in rasters[0].info

@@ -7,7 +7,7 @@ import torch
 
 from abcd_ns.engine.kernels import library
 from abcd_ns.engine.render import TorchRasterizer, self_check
-from abcd_ns.engine.render.self_check import CASES, TOLERANCE, errors, values_and_gradients
+from abcd_ns.engine.render.self_check import TOLERANCE
 from abcd_ns.engine.types import Crop, Gaussians
 
 
@@ -70,9 +70,8 @@ class Broken(TorchRasterizer):
 
 
 def test_a_sound_backend_passes():
-    assert self_check(TorchRasterizer(use_native=False), "cpu") == 0.0
-    # The reference takes the backend's tiles, so that with any it is the very same computation.
-    assert self_check(TorchRasterizer(use_native=False, tile_side=8), "cpu") == 0.0
+    with torch.no_grad():  # as evaluation asks for it
+        assert self_check(TorchRasterizer(use_native=False), "cpu") == 0.0
     if library() is not None:  # close, and not the very same
         assert 0 < self_check(TorchRasterizer(), "cpu") < 1e-4
 
@@ -103,16 +102,13 @@ def test_a_fault_is_refused(fault, what, case):
         self_check(Broken(fault), "cpu")
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 @pytest.mark.parametrize("shift", [-3e-5, 3e-5])
-@pytest.mark.parametrize("tile_side", [4, 16])
-def test_no_case_hangs_on_rounding(case, shift, tile_side):
+def test_no_case_hangs_on_rounding(shift):
     """No fragment is so near to a threshold of drawing that other kernels' rounding would change sides."""
-    draw = TorchRasterizer(use_native=False, tile_side=tile_side)
-    found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
-    assert max(errors(found, expected).values()) < TOLERANCE / 4
 
+    class Rounding(TorchRasterizer):
+        def draw(self, gaussians, shots, **options):
+            logits = gaussians.opacities + shift
+            return super().draw(dataclasses.replace(gaussians, opacities=logits), shots, **options)
 
-def test_gradients_are_checked_where_they_are_switched_off():
-    with torch.no_grad():
-        assert self_check(TorchRasterizer(use_native=False), "cpu") < 1e-6
+    assert 0 < self_check(Rounding(use_native=False, tile_side=16), "cpu") < TOLERANCE / 4

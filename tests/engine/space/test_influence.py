@@ -84,21 +84,6 @@ def test_weights_by_pixel_are_what_is_painted_white_among_what_is_frozen(rasteri
     assert float(found.max()) > 0.5
 
 
-def test_a_view_that_sees_nothing_has_no_influence(rasterizer):
-    view = ring_of_views(2)[1]
-    behind = replace(random_gaussians(5), means=view.center + view.viewmat[2, :3] * -5 + torch.zeros(5, 3))
-    assert influence(behind, torch.zeros(5, dtype=torch.int64), [view], rasterizer) == {}
-    assert not weights(behind, rasterizer, [Shot(view, view.full)]).any()
-
-
-def test_each_shot_has_its_own_weights(rasterizer):
-    gaussians, views = random_gaussians(40, seed=3, size=0.15), ring_of_views(3)
-    shots = [Shot(view, view.full) for view in views]
-    together = weights(gaussians, rasterizer, shots)
-    for shot, row in zip(shots, together, strict=True):
-        torch.testing.assert_close(row, weights(gaussians, rasterizer, [shot])[0])
-
-
 def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer):
     gaussians, views = random_gaussians(80, seed=4, size=0.15), ring_of_views(4)
     tree = build_kd(gaussians.means, 3)
@@ -125,14 +110,6 @@ def test_moved_rows_are_looked_up_anew(rasterizer):
     table.note(gaussians.means, [view], found[None])
     table.note(gaussians.means[few], [view], found[None, few])
     assert list(table.found()[0]) == [1]
-
-
-def test_a_coarser_view_sees_the_same():
-    view = ring_of_views(1, width=50, height=37)[0]
-    small = coarser(view, 2)
-    assert (small.width, small.height) == (25, 19)
-    torch.testing.assert_close(small.K[:2] * 2, view.K[:2])
-    assert float(small.K[2, 2]) == 1
 
 
 @given(

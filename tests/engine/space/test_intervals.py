@@ -11,10 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.render import ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions, ray_interval
-from abcd_ns.engine.space.tree import BlockTree, Box, front_to_back
+from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.types import Crop, View
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
 from tests.reference.scenes import cell_windows
@@ -118,63 +117,3 @@ def test_a_tile_has_the_ray_through_its_middle(side):
             pixel = torch.tensor([(col + 0.5) * side, (row + 0.5) * side, 1.0], dtype=torch.float64)
             expected = view.viewmat[:3, :3].T @ torch.linalg.inv(view.K) @ pixel
             torch.testing.assert_close(found[:, row, col], expected)
-
-
-@given(SEEDS, st.sampled_from([1, 2, 4]), st.data())
-def test_a_window_says_the_same_of_a_part_of_its_crop(seed, side, data):
-    outer = Crop(data.draw(st.integers(0, 40)), data.draw(st.integers(0, 40)), 37, 29)
-    x, y = data.draw(st.integers(0, 36)), data.draw(st.integers(0, 28))
-    grid, part = TileGrid(outer, side), TileGrid(Crop(outer.x + x, outer.y + y, 37 - x, 29 - y), side)
-    near, far = torch.randn(2, grid.tiles, generator=torch.Generator().manual_seed(seed))
-    by_pixel, found = (
-        window.grid.to_image(window.near[None, :, None].expand(1, -1, side * side))[0]
-        for window in (ZWindow(grid, near, far), ZWindow(grid, near, far).on(part))
-    )
-    assert torch.equal(found, by_pixel[y:, x:])
-
-
-def test_a_window_says_nothing_about_other_tiles_or_what_lies_beside_it():
-    window = ZWindow.everything(TileGrid(Crop(8, 8, 16, 16), 4), "cpu", torch.float32)
-    for grid in (TileGrid(Crop(8, 8, 16, 16), 8), TileGrid(Crop(4, 8, 16, 16), 4)):
-        with pytest.raises(ValueError, match="says nothing"):
-            window.on(grid)
-
-
-@given(SEEDS, DTYPES)
-def test_a_block_and_its_siblings_tile_z_too(seed, dtype):
-    view = random_view(seed, dtype)
-    tree = tree_around(seed, view)
-    block = seed % tree.num_blocks
-    off_the_path = [
-        node
-        for node in range(1, len(tree.parent))
-        if block not in tree.leaves(node) and block in tree.leaves(int(tree.parent[node]))
-    ]
-    nodes = [tree.node_of(block), *off_the_path]
-    windows = cell_windows(tree, view, pixels(view), nodes)
-    z = torch.stack([end for w in windows for end in (w.near, w.far)]).nan_to_num(posinf=9.0, neginf=-9.0)
-    holders = sum(((w.near <= z) & (z < w.far)).int() for w in windows)
-    assert bool((holders == 1).all())
-
-
-@given(SEEDS, DTYPES)
-def test_a_box_in_front_of_the_camera_is_entered_and_left_where_the_slab_test_says(seed, dtype):
-    view = random_view(seed, dtype)
-    corner, size = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    box = Box(corner, corner + size.abs())
-    window = ray_interval(box, view, pixels(view))
-    # Directions of exactly 0 become tiny here, which sends the planes they are parallel to far away.
-    direction = ray_directions(view, pixels(view)).double().movedim(0, -1)
-    direction = torch.where(direction == 0, 1e-300, direction)
-    a, b = (box.lower - view.center) / direction, (box.upper - view.center) / direction
-    enter, leave = torch.minimum(a, b).amax(dim=-1), torch.maximum(a, b).amin(dim=-1)
-    hit = (leave - enter.clamp(min=0)) > 1e-4
-    inside = bool(box.contains(view.center[None]))
-    missed = (leave - enter.clamp(min=0)) < -1e-4
-    close = {"rtol": 1e-3, "atol": 1e-4, "check_dtype": False}
-    torch.testing.assert_close(window.far[hit], leave[hit], **close)
-    if inside:
-        assert bool((window.near == -math.inf).all())
-    else:
-        torch.testing.assert_close(window.near[hit], enter[hit], **close)
-        assert bool((window.near[missed] == math.inf).all() and (window.far[missed] == math.inf).all())

@@ -12,50 +12,11 @@ from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
 
 
-def corners(tree: BlockTree) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lower and upper corners of all cells, [K, 3] float64."""
-    cells = [tree.cell(block) for block in range(tree.num_blocks)]
-    return torch.stack([c.lower for c in cells]), torch.stack([c.upper for c in cells])
-
-
 def order_of(tree: BlockTree, center: torch.Tensor) -> torch.Tensor:
     """The order under test, [K]; each block is in it once."""
     order = torch.tensor(front_to_back(tree, center))
     assert sorted(order.tolist()) == list(range(tree.num_blocks))
     return order
-
-
-def misordered(cells: tuple, order: torch.Tensor, center: torch.Tensor, directions: torch.Tensor) -> int:
-    """How many rays meet a cell before one that the order puts in front of it; a slab test on every cell."""
-    to_lower, to_upper = ((corner[order] - center) / directions[:, None, :] for corner in cells)
-    enter = torch.minimum(to_lower, to_upper).amax(dim=2).clamp(min=0)
-    leave = torch.maximum(to_lower, to_upper).amin(dim=2)
-    met = leave > enter
-    assert met.any(dim=1).all()
-    latest = torch.where(met, enter, -1.0).cummax(dim=1).values
-    return int((met & (enter < latest)).any(dim=1).sum())
-
-
-def test_order_is_right_for_a_hundred_thousand_rays():
-    """Trees and grids; cameras inside, outside, on faces, edges and corners, and one step beside them."""
-    generator = torch.Generator().manual_seed(0)
-    wrong = rays = 0
-    for seed in range(26):
-        if seed % 4:
-            tree = random_tree(seed, 2 + seed % 19)
-        else:
-            tree = build_grid(lattice_points(seed, 100), counts=(2 + seed % 3, 2, 3))
-        cells, cameras = corners(tree), lattice_points(seed, 16)
-        planes = tree.threshold[tree.axis >= 0]
-        cameras[8:] = planes[torch.randint(len(planes), (8, 3), generator=generator)].float()
-        for i, center in enumerate(cameras.double()):
-            if i % 2:
-                center = torch.nextafter(center, center + torch.randint(-1, 2, (3,), generator=generator))
-            directions = torch.randn(250, 3, generator=generator, dtype=torch.float64)
-            wrong += misordered(cells, order_of(tree, center), center, directions)
-            rays += len(directions)
-    assert rays >= 100_000
-    assert wrong == 0
 
 
 @given(SEEDS, st.integers(1, 10))

@@ -9,14 +9,13 @@ from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_cova
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
+from abcd_ns.engine.render.primitive import SPLATS
 from abcd_ns.engine.render.projection import extents_of
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.space.visibility import footprint, reach_radius, reaches, widest_slant, world_size
+from abcd_ns.engine.space.visibility import footprint, reaches, widest_slant, world_size
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -64,16 +63,15 @@ def test_footprint_is_the_bounds_of_the_pixels_touched(seed, n, margin, align):
     assert footprint_of(means2d, radii, small_view(), margin, align) == expected
 
 
-def test_footprint_of_an_oversized_gaussian_is_the_image():
-    view = small_view()
-    crop = footprint_of(torch.tensor([[1e30, 0.0], [20.0, -1e9]]), torch.tensor([0, 2_000_000_000]), view)
-    assert crop == view.full
-
-
-def test_footprint_ignores_what_is_culled_whatever_its_place():
-    means2d = torch.tensor([[math.nan, 3.0], [5.0, 5.0]])
-    crop = footprint_of(means2d, torch.tensor([0, 2], dtype=torch.int32), small_view(), align=1)
-    assert crop == Crop(3, 3, 4, 4)
+@pytest.mark.parametrize(
+    ("means2d", "radii", "expected"),
+    [
+        ([[1e30, 0.0], [20.0, -1e9]], [0, 2_000_000_000], Crop(0, 0, 40, 30)),
+        ([[math.nan, 3.0], [5.0, 5.0]], [0, 2], Crop(3, 3, 4, 4)),  # what is culled may be anywhere
+    ],
+)
+def test_footprints_of_what_is_huge_or_nowhere(means2d, radii, expected):
+    assert footprint_of(torch.tensor(means2d), torch.tensor(radii), small_view(), align=1) == expected
 
 
 def scattered(seed: int, count: int) -> Gaussians:
@@ -129,54 +127,28 @@ def test_some_draw_in_a_box_and_some_do_not_reach_it():
     assert int(reached.sum()) < 400
 
 
-def test_reach_is_measured_to_the_nearest_point_of_the_box():
-    gaussians = random_gaussians(3)
-    gaussians.means.copy_(torch.tensor([[0.5, 0.5, 0.5], [4.0, 5.0, 0.5], [-9.0, 0.5, 0.5]]))
-    gaussians.scales.copy_(torch.log(torch.tensor([[0.1, 0.1, 0.1], [0.1, 1.0, 0.2], [1.0, 1.0, 1.0]])))
-    box = Box(torch.zeros(3).double(), torch.ones(3).double())
-    radii = [0.1 * DRAWN_SIGMAS, DRAWN_SIGMAS, DRAWN_SIGMAS]
-    assert reach_radius(gaussians.scales).tolist() == pytest.approx(radii)
-    shapes = gaussians.means, gaussians.scales
-    # Distances 0, 5 and 9.
-    assert reaches(*shapes, box, slant=1.0).tolist() == [True, False, False]
-    assert reaches(*shapes, box, slack=1.7, slant=1.0).tolist() == [True, True, False]
-    assert reaches(*shapes, box, slant=3.0).tolist() == [True, True, True]
-    of_each = torch.tensor([0.0, 0.0, 6.0])
-    assert reaches(*shapes, box, slack=of_each, slant=1.0).tolist() == [True, False, True]
-
-
 def ahead(view, distance, count=1):
     """Points on the view's axis."""
     return (view.center + distance * view.viewmat[2, :3]).expand(count, 3)
 
 
-def near_of(views, points):
-    return as_trained(views, points)[0].near
+NEAR_PLANES = {
+    "half the nearest distance": lambda v: ((ahead(v, 2.0), ahead(v, 0.8), ahead(v, 2.5)), 0.4),
+    "beside and behind": lambda v: (
+        (ahead(v, 2.0), ahead(v, 0.1) + 10 * v.viewmat[0, :3], ahead(v, -0.1)),
+        1.0,
+    ),
+    "a wrong match": lambda v: ((ahead(v, 2.0, 5000), ahead(v, 0.05)), 1.0),
+    "no point": lambda _: ((torch.zeros(0, 3),), NEAR_PLANE),
+    "all behind": lambda v: ((ahead(v, -5.0),), NEAR_PLANE),
+}
 
 
-def test_half_the_nearest_distance_in_any_view():
-    views = ring_of_views(3)
-    points = torch.cat((ahead(views[0], 2.0), ahead(views[1], 0.8), ahead(views[2], 2.5)))
-    assert near_of(views, points) == pytest.approx(0.4, rel=1e-2)
-
-
-def test_what_no_photo_shows_does_not_count():
+@pytest.mark.parametrize("points", NEAR_PLANES.values(), ids=NEAR_PLANES)
+def test_the_near_plane_is_half_the_least_distance_that_a_photo_shows(points):
     (view,) = ring_of_views(1)
-    beside = ahead(view, 0.1) + 10 * view.viewmat[0, :3]
-    behind = ahead(view, -0.1)
-    assert near_of([view], torch.cat((ahead(view, 2.0), beside, behind))) == pytest.approx(1.0, rel=1e-3)
-
-
-def test_a_wrong_match_in_thousands_does_not_count():
-    (view,) = ring_of_views(1)
-    points = torch.cat((ahead(view, 2.0, 5000), ahead(view, 0.05)))
-    assert near_of([view], points) == pytest.approx(1.0, rel=1e-2)
-
-
-def test_gsplats_own_where_nothing_is_known():
-    views = ring_of_views(2)
-    assert near_of(views, torch.zeros(0, 3)) == NEAR_PLANE
-    assert near_of(views[:1], ahead(views[0], -5.0)) == NEAR_PLANE
+    given, expected = points(view)
+    assert as_trained([view], torch.cat(given))[0].near == pytest.approx(expected, rel=1e-2)
 
 
 def test_a_camera_far_away_changes_little_for_the_others():
@@ -215,20 +187,3 @@ def test_a_view_that_sees_no_point_reaches_as_far_as_the_others():
     assert [view.reach for view in found] == pytest.approx([0.8, 0.8])
     assert [view.nearest for view in found] == pytest.approx([0.2, 0.0])
     assert as_trained([near], torch.zeros(0, 3))[0].reach == 1.0
-
-
-def test_no_more_points_than_needed_are_looked_at():
-    views = ring_of_views(5) * 200
-    points = ahead(views[0], 2.0, 50_000)
-    assert near_of(views, points) == pytest.approx(near_of(views[:5], points[:1]), rel=1e-3)
-
-
-def test_a_gaussian_before_the_camera_spoils_no_picture():
-    (view,) = ring_of_views(1)
-    scene = random_gaussians(30, seed=3, size=0.2)
-    blinder = replace(scene[:1], means=ahead(view, 0.1).clone(), opacities=torch.full((1, 1), 5.0))
-    both = type(scene).cat([scene, blinder])
-    draw = TorchRasterizer(use_native=False)
-    clear = draw(scene, view, sh_degree=0).color
-    assert float((draw(both, view, sh_degree=0).color - clear).abs().max()) > 0.1
-    assert torch.equal(draw(both, replace(view, near=0.2), sh_degree=0).color, clear)

@@ -36,16 +36,11 @@ class TorchRasterizer(Rasterizer):
         use_native: False draws everything in torch.
         tile_side: pixels along a tile's side; a divisor of 16. The native library has 4.
         primitive: what a Gaussian is.
-
-    Raises:
-        ValueError: `tile_side` does not divide 16.
     """
 
     def __init__(
         self, *, use_native: bool = True, tile_side: int = native.SIDE, primitive: PrimitiveName = "3dgs"
     ) -> None:
-        if tile_side < 1 or 16 % tile_side:
-            raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
         self.primitive = PRIMITIVES[primitive]
         self.name = f"{self.primitive.prefix}torch-4"
         self.tile_side = tile_side
@@ -60,7 +55,6 @@ class TorchRasterizer(Rasterizer):
     def project(
         self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
     ) -> Splats:
-        """See Rasterizer.project."""
         return Splats(self._project(gaussians, [view], sh_degree, antialiased)[0])
 
     def draw(
@@ -95,7 +89,8 @@ class TorchRasterizer(Rasterizer):
                 raise ValueError(NO_ABSGRAD)
             lists.absolute = means2d
         pictures, sums = lists.composite(planes, means2d, weights)
-        info = _info(means2d, planes, shots) | ({"weights": weights} if blend_weights else {})
+        info: dict[str, Any] = {"means2d": means2d, "radii": planes[:, -1].detach().int()}
+        info |= {"weights": weights} if blend_weights else {}
         info |= {"sums": sums} if judge else {}
         return tuple(Raster(*picture, info) for picture in pictures)
 
@@ -186,28 +181,3 @@ def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -
 
 def _each_a_picture(planes: Float[Tensor, "v r n"]) -> list[native.Part]:
     return [native.Part(own, k) for k, own in enumerate(planes)]
-
-
-def _info(
-    means2d: Float[Tensor, "v n 2"], planes: Float[Tensor, "v r n"], shots: Sequence[Shot]
-) -> dict[str, Any]:
-    """What gsplat's densification strategies read."""
-    return {
-        "means2d": means2d,
-        "radii": planes[:, -1].detach().int(),
-        **_image_size([shot.view for shot in shots], planes.device),
-        "n_cameras": len(shots),
-        "gaussian_ids": None,
-    }
-
-
-def _image_size(views: Sequence[View], device: torch.device | str) -> dict[str, int | Tensor]:
-    """`width` and `height` of an `info`: of all views, or, where they differ, of each, [v, 1].
-
-    gsplat's strategies multiply gradients [v, n] by them, to bring these to one scale.
-    """
-    sizes = [(view.width, view.height) for view in views]
-    if len(set(sizes)) == 1:
-        return dict(zip(("width", "height"), sizes[0], strict=True))
-    width, height = torch.tensor(sizes, device=device).T[..., None]
-    return {"width": width, "height": height}

@@ -132,14 +132,10 @@ class Lists:
             _Part(address(planes), planes.shape[1], planes.shape[1], part.picture, part.masked)
             for planes, part in zip(self._parts, parts, strict=True)
         ]
-        pictures, counts = (
-            _Windowed(self.crops, windows),
-            (ctypes.c_int64(len(each)) for each in (rows, crops)),
-        )
-        given = ((_Part * len(rows))(*rows), next(counts), pictures.rows, next(counts))
-        self.handle = _POINTER(
-            library().abcd_lists(int(primitive.name == "2dgs"), *given, int(wants_weights))
-        )
+        pictures, parts_of_all = _Windowed(self.crops, windows), (_Part * len(rows))(*rows)
+        given = parts_of_all, ctypes.c_int64(len(rows)), pictures.rows, ctypes.c_int64(len(crops))
+        is_surfel = int(primitive.name == "2dgs")
+        self.handle = _POINTER(library().abcd_lists(is_surfel, *given, int(wants_weights)))
         weakref.finalize(self, library().abcd_free, self.handle)
 
     def draw(self, windows: Windows = (), keep: bool = False) -> Pictures:
@@ -167,7 +163,6 @@ class Lists:
         return list(zip(drawn, drawn, drawn, strict=True)), self
 
     def ask(self, residuals: Sequence[Tensor]) -> None:
-        """See ResidualSums."""
         self.residuals = [residual.contiguous() for residual in residuals]
 
     def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:

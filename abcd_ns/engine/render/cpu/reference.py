@@ -52,14 +52,12 @@ class Lists:
         return self.planes[DEPTH].index_select(0, self.column)
 
     def draw(self, windows: Windows = ()) -> Pictures:
-        """See native.Lists."""
         lists = self.within(windows) if windows else self
         return lists._composited(self.planes[: self.primitive.graded])
 
     def composite(
         self, planes: Float[Tensor, "v r n"], means2d: Float[Tensor, "v n 2"], weights: Tensor | None
     ) -> tuple[Pictures, ResidualSums]:
-        """See native.Lists."""
         own = list(planes[:, : self.primitive.graded].unbind(1))
         others = self.planes[: self.primitive.graded, own[0].numel() :]
         # The leaves add nothing, and get the gradients.
@@ -74,13 +72,11 @@ class Lists:
         return self._composited(rows), SumsApart(partial(self._residual_sums, planes.detach()))
 
     def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:
-        """See native.Lists."""
         found = torch.zeros(self.planes.shape[1], dtype=torch.bool, device=self.planes.device)
         return found.index_fill(0, self.within(windows).column, True)
 
     @torch.no_grad()
     def shown(self, visible: float) -> list[Float[Tensor, "2 _t"]]:
-        """See native.Lists."""
         found, weights = [], self._pair_weights()
         for start, grid in zip(_first_tiles(self.grids), self.grids, strict=True):
             own = (self.tile >= start) & (self.tile < start + grid.tiles)
@@ -89,7 +85,6 @@ class Lists:
         return found
 
     def deepen(self, windows: Windows, left: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> None:
-        """See native.Lists."""
         ((found, behind),) = self.within(windows)._walked(
             self.planes[: self.primitive.graded], [torch.stack((left, depth))], _deepened
         )

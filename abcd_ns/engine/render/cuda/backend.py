@@ -17,9 +17,9 @@ from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.kinds import kind_of
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
-from abcd_ns.engine.render.cuda.projection import Projected, place_on_screen, project
+from abcd_ns.engine.render.cuda.projection import place_on_screen, project
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
-from abcd_ns.engine.render.projection import Splats, check_degree, extents_of
+from abcd_ns.engine.render.projection import Splats, extents_of
 from abcd_ns.engine.render.residual_sums import SumsApart
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
@@ -40,15 +40,10 @@ class GsplatRasterizer(Rasterizer):
         self.primitive, self._kind = PRIMITIVES[primitive], kind_of(primitive)
         self.name = f"{self.primitive.prefix}gsplat-{gsplat.__version__}"
 
-    def warm_up(self) -> None:
-        """Nothing: gsplat compiles at its first call, which is the self-check's."""
-
     @torch.no_grad()
     def project(
         self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
     ) -> Splats:
-        """See Rasterizer.project."""
-        check_degree(gaussians, sh_degree)
         return project(self._kind, gaussians, [view], sh_degree, antialiased).splats(0)
 
     @torch.no_grad()
@@ -78,7 +73,6 @@ class GsplatRasterizer(Rasterizer):
         judge: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
-        check_degree(gaussians, sh_degree)
         rasters: dict[int, Raster] = {}
         # Windows mask what is frozen, or the Gaussians: no list has both.
         kinds = [(_size(shot.view), shot.frozen is None) for shot in shots]
@@ -86,8 +80,6 @@ class GsplatRasterizer(Rasterizer):
             alike = [shots[k] for k in places]
             drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, blend_weights, judge)
             rasters.update(zip(places, drawn, strict=True))
-        for raster in rasters.values():
-            raster.info["n_cameras"] = len(shots)
         return tuple(rasters[k] for k in range(len(shots)))
 
     @torch.no_grad()
@@ -95,7 +87,6 @@ class GsplatRasterizer(Rasterizer):
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and sorted once, and a few are drawn in one pass."""
-        check_degree(gaussians, sh_degree)
         for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
             views, crops = [shot.view for shot in few], [shot.crop for shot in few]
             seen = project(self._kind, gaussians, views, sh_degree, antialiased)
@@ -115,7 +106,6 @@ class GsplatRasterizer(Rasterizer):
         visible: float,
         antialiased: bool = False,
     ) -> Iterator[ZWindow]:
-        """See Rasterizer.depth_windows."""
         for few in _a_few(seen, seen, gaussians):
             views, crops = zip(*few, strict=True)
             projected = project(self._kind, gaussians, views, 0, antialiased)
@@ -136,7 +126,8 @@ class GsplatRasterizer(Rasterizer):
             (k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen is not None and len(shot.frozen)
         ]
         own = project(self._kind, gaussians, views, sh_degree, antialiased, blend_weights)
-        info = _info(own, views[0]) | ({"weights": own.weights} if blend_weights else {})
+        info: dict[str, Any] = {"means2d": own.centers, "radii": own.radii}
+        info |= {"weights": own.weights} if blend_weights else {}
         if len(gaussians) == 0 and not frozen:  # gsplat is not asked
             colors = [own.centers.sum().expand(crop.height, crop.width, 3) for crop in crops]
             return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]
@@ -171,13 +162,3 @@ def _size(view: View) -> tuple[int, int, float]:
 def _alike(kinds: Sequence[object]) -> list[list[int]]:
     """Places of equal kinds."""
     return [[k for k, each in enumerate(kinds) if each == kind] for kind in dict.fromkeys(kinds)]
-
-
-def _info(own: Projected, view: View) -> dict[str, Any]:
-    return {
-        "means2d": own.centers,
-        "radii": own.radii,
-        "width": view.width,
-        "height": view.height,
-        "gaussian_ids": None,
-    }

@@ -39,17 +39,14 @@ class Drawn(Raster):
 
     @cached_property
     def color(self) -> Float[Tensor, "h w 3"]:
-        """See Raster."""
         return self._features[..., :3]
 
     @cached_property
     def depth(self) -> Float[Tensor, "h w"]:
-        """See Raster."""
         return self._features[..., 3]
 
     @cached_property
     def transmittance(self) -> Float[Tensor, "h w"]:
-        """See Raster."""
         return 1.0 - self.alphas[self.camera][self.part][..., 0]
 
 

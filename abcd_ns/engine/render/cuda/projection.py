@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
-from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.projection import Splats, check_degree
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 KEPT = 1 << 14
@@ -123,6 +123,7 @@ def project(
         views: of one size and near plane.
         blend_weights: give zeros for the depths that are composited.
     """
+    check_degree(gaussians, sh_degree)
     if len(gaussians) == 0:  # of which gsplat's kernels are not asked
         return Projected.nothing(len(views), kind.shape, gaussians)
     placed, eyes = place_on_screen(kind, gaussians, views, antialiased)
