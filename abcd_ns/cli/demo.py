@@ -3,17 +3,18 @@
 import math
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.terminal import print_facts, print_plain
-from abcd_ns.cli.train import find_tool
+from abcd_ns.cli.train import tool
 from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.lab.runs.runner import take_folder, taking
 from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
@@ -21,7 +22,7 @@ from abcd_ns.run import STATE
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.texts import clock
 
-SCENE = {"courts": 1, "views_per_court": 56, "width": 256, "height": 192, "points_per_court": 24_000}
+SCENE = {"courts": 1, "views-per-court": 56, "width": 256, "height": 192, "points-per-court": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
@@ -43,15 +44,10 @@ def demo(
         out: Folder for the results: new, empty, or of an earlier demo.
         seconds: Training time. The rest takes about a minute on two cores.
         blocks: Number of blocks.
-
-    Raises:
-        UserError: `out` holds something else or cannot be written, an option is out of range, nerfstudio is
-            not installed, or a command failed.
     """
+    check_ranges({"blocks": blocks})
     if not 0 < seconds < math.inf:
         raise UserError(f"--seconds is {seconds}; it must be above 0 and finite.")
-    if blocks < 1:
-        raise UserError(f"--blocks is {blocks}; it must be at least 1.")
     with taking(out):
         take_folder(out, out / MARKER, "demo")
         (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
@@ -69,27 +65,30 @@ def demo(
 
 def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[str]]:
     """What is typed, one after the other."""
-    scene, name = out / "scene", run.parent.parent.name
-    flags = [word for flag, value in SCENE.items() for word in (f"--{flag.replace('_', '-')}", value)]
-    train = ["ns-train", "abcd", "--data", scene.resolve(), "--output-dir", run.parents[2]]
-    train += ["--experiment-name", name, "--timestamp", run.name, "--vis", "tensorboard"]
-    train += ["--viewer.quit-on-train-completion", True, "--pipeline.blocks", blocks]
-    train += ["--pipeline.max-seconds", f"{seconds:g}"]
-    never = (
-        "--max-num-iterations",
-        "--steps-per-save",
-        "--steps-per-eval-image",
-        "--steps-per-eval-all-images",
-    )
-    train += [word for flag in never for word in (flag, NEVER)]
-    export = ["ns-export", "gaussian-splat", "--load-config", run / "config.yml", "--output-dir", out]
-    commands = (
-        ["abcd", "synth", scene, *flags, "--overwrite"],
-        train,
-        [*export, "--output-filename", "splat.ply"],
-        ["abcd", "report", run, "--data", scene, "--out", out / "report.html"],
-    )
-    return [list(map(str, command)) for command in commands]
+    scene, never = out / "scene", ("max-num-iterations", "steps-per-save", "steps-per-eval-image")
+    options = {
+        "data": scene.resolve(),
+        "output-dir": run.parents[2],
+        "experiment-name": run.parents[1].name,
+        "timestamp": run.name,
+        "vis": "tensorboard",
+        "viewer.quit-on-train-completion": True,
+        "pipeline.blocks": blocks,
+        "pipeline.max-seconds": f"{seconds:g}",
+        **dict.fromkeys((*never, "steps-per-eval-all-images"), NEVER),
+    }
+    exported = {"load-config": run / "config.yml", "output-dir": out, "output-filename": "splat.ply"}
+    page = {"data": scene, "out": out / "report.html"}
+    return [
+        ["abcd", "synth", str(scene), *_flags(SCENE), "--overwrite"],
+        ["ns-train", "abcd", *_flags(options)],
+        ["ns-export", "gaussian-splat", *_flags(exported)],
+        ["abcd", "report", str(run), *_flags(page)],
+    ]
+
+
+def _flags(options: Mapping[str, Any]) -> list[str]:
+    return [word for name, value in options.items() for word in (f"--{name}", str(value))]
 
 
 def _run(command: Sequence[str], logs: Path, console: Console) -> None:
@@ -97,12 +96,10 @@ def _run(command: Sequence[str], logs: Path, console: Console) -> None:
     print_plain(f"$ {' '.join(command)}", console, style="dim")
     program, *words = command
     name = words[0] if program == "abcd" else program
-    log, shown, tool = logs / f"{name}.log", program == "ns-train", find_tool(program)
-    if tool is None:
-        raise UserError(f"There is no {program} here; install nerfstudio into this environment.")
+    log, shown = logs / f"{name}.log", program == "ns-train"
     with open(log, "wb") as file:
         output = {} if shown else {"stdout": file, "stderr": subprocess.STDOUT}
-        done = subprocess.run([tool, *words], stdin=subprocess.DEVNULL, check=False, **output)
+        done = subprocess.run([tool(program), *words], stdin=subprocess.DEVNULL, check=False, **output)
     if done.returncode != 0:
         where = "its output above" if shown else log
         raise UserError(f"{name} failed with exit code {done.returncode}; see {where}.")
@@ -118,7 +115,7 @@ def _sum_up(out: Path, run: Path, seconds: float, taken: float, console: Console
         "Gaussians": f"{end.gaussians:,}",
         "peak RAM": f"{bytes_in_words(end.peak_rss_bytes)} in training",
         "not visited": f"{missed} of {story.blocks} blocks",
-        "time": f"{taken:.0f} s, training {story.seconds:.0f} s of it",
+        "time": f"{taken:.0f} s, training {story.end.seconds:.0f} s of it",
         "report": str(out / "report.html"),
         "Gaussians for viewers": str(out / "splat.ply"),
     }

@@ -1,18 +1,15 @@
-"""What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do; --json."""
+"""What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rich.console import Console
 
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
-from abcd_ns.errors import UserError
-from abcd_ns.lab.results.records import encode, write_json
 
 Level = Literal["error", "warning", "note"]
 STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}
@@ -67,28 +64,3 @@ def _print(finding: Finding, console: Console) -> None:
     if fix:
         lines += textwrap.wrap(fix, initial_indent="    -> ", subsequent_indent="       ", **wide)
     print_plain("\n".join(lines), console)
-
-
-def check_json(path: Path | None) -> None:
-    """Refuse, before any work, a file that could not be written.
-
-    Raises:
-        UserError: `path` is a folder, or lies in none.
-    """
-    if path is not None and path.is_dir():
-        raise UserError(f"--json {path} is a folder; name a file.")
-    if path is not None and not path.parent.is_dir():
-        raise UserError(f"--json {path}: the folder {path.parent} does not exist; make it first.")
-
-
-def write_report(path: Path | None, report: Any) -> None:
-    """Write a frozen dataclass; None writes nothing.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    try:
-        if path is not None:
-            write_json(path, encode(report))
-    except OSError as error:
-        raise UserError(f"--json {path} cannot be written ({error.strerror}); name another file.") from None

@@ -1,6 +1,7 @@
 """The `abcd` command: imports the subcommand that is called, and nothing else."""
 
 import difflib
+import errno
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -17,7 +18,8 @@ EXIT_INTERRUPTED = 130
 class Command(NamedTuple):
     """A subcommand: `target` is the "module:function" that tyro makes a command line of.
 
-    The function may return an exit code; None is 0.
+    The function may return an exit code; None is 0. It raises UserError where an option is out of range, what
+    it is given cannot be used, or what it shall write is there already.
     """
 
     name: str
@@ -57,29 +59,23 @@ COMMANDS = (
     ),
 )
 
-EXAMPLES = {
-    "abcd demo": "see it work, without a GPU or data",
-    "abcd check --data garden": "see whether your photos can be trained on",
-    "ns-train abcd --data garden": "train on them",
-    "abcd train cpu --data garden": "train without a GPU",
-    "abcd report --help": "the options of one command",
-}
+HELP = """usage: abcd COMMAND [OPTIONS]
 
+Train 3D Gaussian Splatting scenes larger than the GPU, one block at a time.
 
-def help_text() -> str:
-    """The text of `abcd --help`."""
-    options = {"--help": "show this text, or after a command its options", "--version": "show the version"}
-    return "\n".join(
-        [
-            "usage: abcd COMMAND [OPTIONS]\n",
-            "Train 3D Gaussian Splatting scenes larger than the GPU, one block at a time.\n\ncommands:",
-            *(f"  {command.name:<12}{command.help}" for command in COMMANDS),
-            "\noptions:",
-            *(f"  {name:<12}{what}" for name, what in options.items()),
-            "\nexamples:",
-            *(f"  {example:<30}{what}" for example, what in EXAMPLES.items()),
-        ]
-    )
+commands:
+{commands}
+
+options:
+  --help      show this text, or after a command its options
+  --version   show the version
+
+examples:
+  abcd demo                     see it work, without a GPU or data
+  abcd check --data garden      see whether your photos can be trained on
+  ns-train abcd --data garden   train on them
+  abcd train cpu --data garden  train without a GPU
+  abcd report --help            the options of one command"""
 
 
 def find_command(name: str) -> Command:
@@ -96,25 +92,13 @@ def find_command(name: str) -> Command:
     raise UserError(f"abcd has no command {name!r}; {hint}")
 
 
-def run_command(command: Command, args: Sequence[str]) -> int:
+def run_command(command: Command, args: list[str]) -> int:
     """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
     if command.passes_on:
-        return command.load()(list(args))
-    # Here and not above: `abcd --help` has no use for it.
-    import tyro
+        return command.load()(args)
+    import tyro  # `abcd --help` has no use for it
 
-    return tyro.cli(command.load(), prog=f"abcd {command.name}", args=list(args)) or 0
-
-
-def refuse(message: str) -> int:
-    """Print what the user can mend on stderr, in red where a person reads it; returns the exit code."""
-    # Here and not above: `abcd --help` has no use for it.
-    from rich.console import Console
-
-    from abcd_ns.cli.terminal import print_plain
-
-    print_plain(f"error: {message}", Console(stderr=True), "red")
-    return EXIT_USER_ERROR
+    return tyro.cli(command.load(), prog=f"abcd {command.name}", args=args) or 0
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -126,24 +110,29 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
     """
-    args = sys.argv[1:] if args is None else args
-    first = args[0] if args else "--help"
+    first, *others = (sys.argv[1:] if args is None else args) or ["--help"]
     try:
         if first in ("--help", "-h"):
-            print(help_text())
+            print(HELP.format(commands="\n".join(f"  {each.name:<12}{each.help}" for each in COMMANDS)))
             return 0
         if first == "--version":
             print(f"abcd {__version__}")
             return 0
-        return run_command(find_command(first), args[1:])
+        return run_command(find_command(first), others)
     except UserError as error:
-        return refuse(str(error))
+        message = str(error)
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        return refuse(f"{error.filename} cannot be used: {error.strerror}.")
+        message = f"{error.filename or 'What it writes'} cannot be used: {error.strerror}."
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    from rich.console import Console  # `abcd --help` has no use for it
+
+    from abcd_ns.cli.terminal import print_plain
+
+    print_plain(f"error: {message}", Console(stderr=True), "red")
+    return EXIT_USER_ERROR
 
 
 if __name__ == "__main__":

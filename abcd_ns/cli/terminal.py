@@ -20,15 +20,10 @@ def print_facts(facts: Mapping[str, str], console: Console) -> None:
         print_plain(f"{name:<{width}}  {value}", console)
 
 
-def few(names: Sequence[str], count: int | None = None) -> str:
-    """The first names of a list, and how many more there are.
-
-    Args:
-        count: of the whole list, where `names` is only its beginning.
-    """
-    shown, count = list(names[:NAMED]), len(names) if count is None else count
-    more = [f"{count - len(shown)} more"] if count > len(shown) else []
-    return ", ".join(shown + more)
+def few(names: Sequence[str]) -> str:
+    """The first names of a list, and how many more there are."""
+    more = [f"{len(names) - NAMED} more"] if len(names) > NAMED else []
+    return ", ".join([*names[:NAMED], *more])
 
 
 def many(count: int, one: str, several: str) -> str:

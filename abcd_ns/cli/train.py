@@ -21,7 +21,6 @@ Run `ns-train` with the options of a TOML file. Options given here replace those
 cpu, small-gpu and garden come with abcd. A file begins with the method of ns-train: method = "abcd".
 Options stand in tables: --pipeline.blocks 8 is blocks = 8 in [pipeline].
 docs/reference.md lists all options."""
-METHOD = "method"
 
 
 def train(words: list[str]) -> int:
@@ -29,17 +28,11 @@ def train(words: list[str]) -> int:
 
     Args:
         words: the file, and options to hand on.
-
-    Raises:
-        UserError: the file cannot be read, or there is no `ns-train`.
     """
     if not words or words[0] in ("-h", "--help"):
         print(USAGE)
         return 0
-    ns_train = find_tool("ns-train")
-    if ns_train is None:
-        raise UserError("There is no ns-train here; install nerfstudio into this environment.")
-    command = [ns_train, *command_line(Path(words[0])), *words[1:]]
+    command = [tool("ns-train"), *command_line(Path(words[0])), *words[1:]]
     os.execv(command[0], command)
 
 
@@ -50,7 +43,7 @@ def command_line(path: Path) -> list[str]:
         UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
     """
     data = read_toml(path, f"{path} does not exist.", trains=True)
-    method = data.pop(METHOD, None)
+    method = data.pop("method", None)
     if not isinstance(method, str):
         raise UserError(f'{path} names no method; begin it with: method = "abcd"')
     return [method, *_flags(data, "--", path)]
@@ -68,5 +61,11 @@ def _flags(table: Mapping[str, Any], prefix: str, path: Path) -> Iterator[str]:
 
 def find_tool(name: str) -> str | None:
     """The command of this name beside this Python, or else on the PATH."""
-    beside = Path(sys.executable).with_name(name)
-    return str(beside) if beside.exists() else shutil.which(name)
+    return shutil.which(name, path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
+
+
+def tool(name: str) -> str:
+    """As `find_tool`; UserError where there is none."""
+    if (found := find_tool(name)) is None:
+        raise UserError(f"There is no {name} here; install nerfstudio into this environment.")
+    return found

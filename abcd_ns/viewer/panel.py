@@ -27,7 +27,7 @@ from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
 from abcd_ns.viewer.scenery import Scenery, boxes_of, bulk, first_look, nearest_view, views_that_see
 from abcd_ns.viewer.status import BlockRow, Status, status_of, time_left
-from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
+from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, worker_line
 
 AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
 """Events that the browser is told of at once, of others once in SECONDS_BETWEEN_UPDATES."""
@@ -66,7 +66,7 @@ class AbcdPanel(ViewerControl):
         self._stage = ""
         """What is done between steps."""
         self._workers: tuple[WorkerSeen, ...] = ()
-        self._was_over = False
+        self._over = False
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
         self._bounds: Box | None = None
@@ -157,10 +157,10 @@ class AbcdPanel(ViewerControl):
         state = coordinator.state
         said = headline(self._where(state), coordinator.progress, time_left(coordinator))
         sweep = f"Sweep {state.sweep}: {len(state.queue)} visits are waiting" if state.queue else ""
-        if over := coordinator.finished and not self._stage:
-            said = "**Trained.**"
-        if over and not self._was_over:
-            self._was_over, self._controls.boxes.value = True, False  # they were about the training
+        over = coordinator.finished and not self._stage
+        if over and not self._over:
+            self._over, self._controls.boxes.value = True, False  # they were about the training
+        said = "**Trained.**" if over else said
         self._controls.write(headline=said, sweep=sweep)
         self._controls.progress(coordinator.progress)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
@@ -171,7 +171,7 @@ class AbcdPanel(ViewerControl):
     def _where(self, state: RunState) -> str:
         active = state.active
         if active is None and self._workers and not self._stage:
-            return workers_line(self._workers)
+            return "  \n".join(map(worker_line, self._workers))
         if active is None and self._coordinator.config.recipe.exact:
             return "All blocks at once"
         if active is None:
@@ -220,7 +220,7 @@ class AbcdPanel(ViewerControl):
             client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
 
-    # -- what the user chooses -----------------------------------------------------------------------
+    # -- what the user chooses
 
     def _choose(self) -> None:
         with self.viewer.train_lock or nullcontext():

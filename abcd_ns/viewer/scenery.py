@@ -55,37 +55,31 @@ class Scenery:
     def __init__(self, scene: viser.SceneApi, frustum_scale: float) -> None:
         self._scene, self._frustum_scale = scene, frustum_scale
         self._boxes: dict[int, Box] = {}
-        self._status: dict[int, Status] = {}
-        self._shown = True
-        self._nodes: dict[int, list[viser.SceneNodeHandle]] = {}
+        self._drawn: dict[int, tuple[Status, bool]] = {}
+        """By block, its state and whether its box is visible."""
         self._frusta: list[viser.SceneNodeHandle] = []
 
     def set_boxes(self, boxes: Mapping[int, Box]) -> None:
         """The boxes to show, by block; drawn when their states are known."""
-        self._boxes, self._status = dict(boxes), {}
+        self._boxes, self._drawn = dict(boxes), {}
 
-    def show_boxes(self, status: Mapping[int, Status], shown: bool) -> None:
+    def show_boxes(self, status: Mapping[int, Status], visible: bool) -> None:
         """Colour the boxes by the states of their blocks."""
         for block, box in self._boxes.items():
-            if status.get(block) != self._status.get(block):
-                self._nodes[block] = self._draw_box(block, box, status[block], shown)
-        if shown != self._shown:
-            for node in (node for nodes in self._nodes.values() for node in nodes):
-                node.visible = shown
-        self._status, self._shown = dict(status), shown
+            if self._drawn.get(block) != (status[block], visible):
+                self._drawn[block] = status[block], visible
+                self._draw_box(block + 1, box, status[block], visible)
 
-    def _draw_box(self, block: int, box: Box, status: Status, shown: bool) -> list[viser.SceneNodeHandle]:
-        active = status is Status.ACTIVE
-        edges, number = edges_of(box), block + 1
-        name, label = f"/abcd/block_{number}", f"/abcd/label_{number}"
-        look = {"color": COLORS[status], "visible": shown, "line_width": ACTIVE_WIDTH if active else WIDTH}
+    def _draw_box(self, number: int, box: Box, status: Status, visible: bool) -> None:
+        """Draw it in place of what has its name."""
+        active, edges = status is Status.ACTIVE, edges_of(box)
+        look = {"color": COLORS[status], "line_width": ACTIVE_WIDTH if active else WIDTH, "visible": visible}
         straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": len(edges) - 1}
-        nodes = [self._scene.add_spline_catmull_rom(name, edges, **straight, **look)]
+        self._scene.add_spline_catmull_rom(f"/abcd/block_{number}", edges, **straight, **look)
         if len(self._boxes) <= MOST_LABELS:
             text = f"{number} {status.value}" if active else str(number)
             position = tuple(((box.lower + box.upper) / 2 * SCENE_SCALE).tolist())
-            nodes.append(self._scene.add_label(label, text, position=position, visible=shown))
-        return nodes
+            self._scene.add_label(f"/abcd/label_{number}", text, position=position, visible=visible)
 
     def show_cameras(self, views: Sequence[View]) -> None:
         """Frusta of these cameras and no others."""

@@ -39,12 +39,8 @@ def headline(where: str, progress: float, left: float | None) -> str:
     return f"**{where}**  \n{progress:.0%} of the run, {clock(left)} left"
 
 
-def workers_line(workers: Sequence[WorkerSeen]) -> str:
-    """What each worker is doing, counted from 1."""
-    return "  \n".join(map(_of_worker, workers))
-
-
-def _of_worker(worker: WorkerSeen) -> str:
+def worker_line(worker: WorkerSeen) -> str:
+    """What a worker is doing; workers count from 1."""
     what = "waits" if worker.visits else "is starting"
     if worker.block is not None:
         what = f"block {worker.block + 1}, step {worker.done} of {worker.steps}"
@@ -55,11 +51,9 @@ def _of_worker(worker: WorkerSeen) -> str:
 
 def block_table(rows: Sequence[BlockRow]) -> str:
     """The blocks by number, counted from 1 as in the terminal, without columns that nothing is known of."""
-    shown = list(rows)
-    if len(rows) > MOST_ROWS:
-        urgent = (Status.ACTIVE, Status.UNDER_OBSERVED)
-        first = sorted(rows, key=lambda row: (row.status not in urgent, row.block))[:MOST_ROWS]
-        shown = sorted(first, key=lambda row: row.block)
+    urgent = (Status.ACTIVE, Status.UNDER_OBSERVED)
+    first = sorted(rows, key=lambda row: (row.status not in urgent, row.block))[:MOST_ROWS]
+    shown = sorted(first, key=lambda row: row.block)
     trained = any(row.psnr is not None or row.views is not None for row in rows)
     lines = ["| # | state | Gaussians |" + " PSNR | views |" * trained]
     lines += ["| ---: | --- | ---: |" + " ---: | ---: |" * trained]
@@ -72,12 +66,15 @@ def block_table(rows: Sequence[BlockRow]) -> str:
 
 
 def _row(row: BlockRow, trained: bool) -> str:
-    state = f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value
-    line = f"| {row.block + 1} | {state} | " + ("-" if row.gaussians is None else f"{row.gaussians:,}") + " |"
-    if not trained:
-        return line
-    psnr = "-" if row.psnr is None else f"{row.psnr:.2f}"
-    return f"{line} {psnr} | {'-' if row.views is None else row.views} |"
+    cells = [
+        str(row.block + 1),
+        f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value,
+        "-" if row.gaussians is None else f"{row.gaussians:,}",
+    ]
+    if trained:
+        cells += ["-" if row.psnr is None else f"{row.psnr:.2f}"]
+        cells += ["-" if row.views is None else str(row.views)]
+    return f"| {' | '.join(cells)} |"
 
 
 def memory_table(rows: Sequence[tuple[str, int, int]]) -> str:

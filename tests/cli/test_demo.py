@@ -70,7 +70,7 @@ class StandIns:
 @pytest.fixture
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
-    monkeypatch.setattr(demo_module, "find_tool", lambda name: str(stand_ins.folder / name))
+    monkeypatch.setattr(demo_module, "tool", lambda name: str(stand_ins.folder / name))
     return stand_ins
 
 
@@ -87,15 +87,8 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capf
     assert config.data == (out / "scene").resolve()
     printed = capfd.readouterr().out
     assert f"$ abcd synth {out / 'scene'} --courts 1" in printed
-    files = (str(out / "splat.ply"), str(out / "report.html"))
-    for part in (
-        "24.50 dB, SSIM 0.750",
-        "1,234",
-        "3.0 GiB",
-        "0 of 3 blocks",
-        *files,
-        "abcd demo --seconds 10",
-    ):
+    figures = ("24.50 dB, SSIM 0.750", "1,234", "3.0 GiB", "0 of 3 blocks")
+    for part in (*figures, str(out / "splat.ply"), str(out / "report.html"), "abcd demo --seconds 10"):
         assert part in printed
     assert "output of ns-train" in printed
     assert "output of ns-export" not in printed
@@ -110,38 +103,16 @@ def test_a_failing_command_ends_the_demo_in_one_line(commands, tmp_path, monkeyp
     assert commands.calls()[-1][0] == broken
 
 
-@pytest.mark.usefixtures("commands")
-def test_a_second_demo_trains_anew_on_the_same_scene(tmp_path, monkeypatch):
-    stamps = iter(("first", "second"))
-    monkeypatch.setattr(demo_module.time, "strftime", lambda _: next(stamps))
-    out = tmp_path / "demo"
-    assert demo(out=out, seconds=1.0) == demo(out=out, seconds=1.0) == 0
-    assert sorted(path.name for path in (out / "training" / "demo" / "abcd").iterdir()) == ["first", "second"]
-
-
-def test_a_folder_of_something_else_is_left_alone(commands, tmp_path):
+def test_options_out_of_range_and_a_folder_of_something_else_are_refused(commands, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
     with pytest.raises(UserError, match="is not empty and holds no demo"):
         demo(out=tmp_path / "mine")
     assert os.listdir(tmp_path / "mine") == ["thesis.tex"]
-    with pytest.raises(UserError, match="is a file"):
-        demo(out=tmp_path / "mine" / "thesis.tex")
     with pytest.raises(UserError, match=r"thesis.tex/demo cannot be written: Not a directory"):
         demo(out=tmp_path / "mine" / "thesis.tex" / "demo")
+    for option, value in (("seconds", 0.0), ("seconds", float("nan")), ("blocks", 0)):
+        with pytest.raises(UserError, match=f"--{option} is {value}"):
+            demo(out=tmp_path / "demo", **{option: value})
     assert commands.calls() == []
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seconds": 0.0}, "--seconds is 0"),
-        ({"seconds": float("nan")}, "--seconds is nan"),
-        ({"seconds": float("inf")}, "--seconds is inf"),
-        ({"blocks": 0}, "--blocks is 0"),
-    ],
-)
-def test_options_out_of_range_are_refused(tmp_path, options, message):
-    with pytest.raises(UserError, match=message):
-        demo(out=tmp_path / "demo", **options)
     assert not (tmp_path / "demo").exists()

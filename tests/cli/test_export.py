@@ -105,18 +105,15 @@ def test_the_datas_frame_is_where_the_photos_were_posed(run, scene, tmp_path, ca
     distances = torch.cdist(back, scene.means.double()).min(dim=1).values
     assert len(found) == len(scene) - 1
     assert float(distances.max()) < 1e-5
-    own = read_own(run, tmp_path)
+    export(run, out=tmp_path / "own.ply", frame="nerfstudio")
+    own = read(tmp_path / "own.ply")
     assert np.allclose(np.sort(found["scale_0"]), np.sort(own["scale_0"]) - math.log(FRAME.scale), atol=1e-5)
     assert "299 Gaussians" in capsys.readouterr().out
 
 
-def read_own(run, tmp_path) -> np.ndarray:
-    export(run, out=tmp_path / "own.ply", frame="nerfstudio")
-    return read(tmp_path / "own.ply")
-
-
 def test_the_blocks_files_together_are_the_scene(run, tmp_path):
-    whole = by_position(read_own(run, tmp_path))
+    export(run, out=tmp_path / "whole.ply", frame="nerfstudio")
+    whole = by_position(read(tmp_path / "whole.ply"))
     export(run / "config.yml", out=tmp_path / "parts", by_block=True, frame="nerfstudio")
     parts = sorted((tmp_path / "parts").iterdir())
     assert [path.name for path in parts] == [f"block-{n:04d}.ply" for n in range(1, BLOCKS + 1)]
@@ -145,28 +142,20 @@ def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "rounds positions to 0." in said
     assert "--frame nerfstudio" in said
-
-
-def test_a_single_gaussian_has_no_size_to_lose_digits_of(capsys):
-    tell_rounding(".ply", largest=5e6, size=0.0)
+    tell_rounding(".ply", largest=5e6, size=0.0)  # a single Gaussian has no size to lose digits of
     assert capsys.readouterr().out == ""
 
 
 def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):
-    box = (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)
+    (run / TRANSFORMS).write_text("{}")
     for words, options in {
         "no Gaussian to export in this box": {"box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)},
-        "Y0 < Y1": {"box": box},
+        "Y0 < Y1": {"box": (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)},
+        "exists already": {"out": run},
+        "cannot be read": {"frame": "data"},
     }.items():
         with pytest.raises(UserError, match=words):
-            export(run, out=tmp_path / "new.ply", **options)
-    with pytest.raises(UserError, match="exists already"):
-        export(run, out=run)
-    with pytest.raises(UserError, match=f"no run with abcd/store: did you mean {run}"):
-        export(tmp_path, out=tmp_path / "new.ply", frame="nerfstudio")
-    (run / TRANSFORMS).write_text("{}")
-    with pytest.raises(UserError, match="cannot be read"):
-        export(run, out=tmp_path / "new.ply")
+            export(run, **{"out": tmp_path / "new.ply", "frame": "nerfstudio", **options})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
 
 

@@ -71,21 +71,12 @@ def test_cameras_are_where_they_were(places, found):
     similarity = pycolmap.estimate_sim3d(seen, true)
     moved = np.array([similarity * center for center in seen])
     assert np.linalg.norm(moved - true, axis=1).max() < 0.03
-
-
-def test_the_focal_length_is_found_though_no_photo_tells_it(found):
-    (camera,) = pycolmap.Reconstruction(str(found / "sparse/0")).cameras.values()
+    (camera,) = model.cameras.values()  # no photo tells its focal length
     assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.03)
-
-
-def test_the_result_can_be_trained_on_and_nothing_else_is_left(found):
-    outputs = parser(found).get_dataparser_outputs("train")
+    outputs = parser(found).get_dataparser_outputs("train")  # it can be trained on
     assert len(outputs.image_filenames) == 10
     assert len(outputs.metadata["points3D_xyz"]) > 100
     assert sorted(path.name for path in found.iterdir()) == ["images", "sparse"]
-
-
-def test_an_earlier_model_is_not_overwritten(found):
     with pytest.raises(UserError, match="exists already"):
         poses(found)
 
@@ -105,11 +96,7 @@ def test_photos_that_show_nothing_are_refused_and_nothing_is_left(tmp_path):
 
 def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
     monkeypatch.setattr(command, "find_poses", None)
-    with pytest.raises(UserError, match="put the photos there"):
-        poses(tmp_path)
     write_blank(tmp_path, 2)
-    with pytest.raises(UserError, match="has 2 photos"):
-        poses(tmp_path)
     (tmp_path / "images" / "2.png").write_bytes(b"no picture")
     with pytest.raises(UserError, match=r"2\.png"):
         poses(tmp_path)

@@ -44,7 +44,7 @@ def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, 
     assert isinstance(config.pipeline.datamanager.dataparser, ColmapDataParserConfig)
     assert "psnr" in evaluated(theirs.base_dir, tmp_path)
     found = open_run(theirs.base_dir)
-    assert isinstance(load_pipeline(found, found.checkpoint, data).model, AbcdModel)
+    assert isinstance(load_pipeline(found, data).model, AbcdModel)
     again = shlex.split(training_command(found.settings).replace("\\\n", ""))
     assert again[again.index("colmap") :] == ["colmap", "--colmap-path", "sparse/0"]
 
@@ -52,7 +52,7 @@ def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, 
 def test_the_wrong_data_for_another_reader_is_one_line(theirs, tmp_path):
     found, out = open_run(theirs.base_dir), tmp_path / "new.ply"
     with pytest.raises(InputError, match=f"colmap cannot read {tmp_path}"):
-        load_pipeline(found, found.checkpoint, tmp_path)
+        load_pipeline(found, tmp_path)
     assert report(theirs.base_dir, data=tmp_path, out=tmp_path / "page.html") == 0
     assert "colmap cannot read" in (tmp_path / "page.html").read_text()
     with pytest.raises(InputError, match=f"colmap cannot read {tmp_path}"):

@@ -1,6 +1,5 @@
 """The guard before a real viser server: each of these requests is sent over a socket."""
 
-import asyncio
 import threading
 import time
 from collections.abc import Iterator
@@ -12,12 +11,9 @@ import pytest
 import viser
 from nerfstudio.viewer.render_panel import populate_render_tab
 from viser.infra import _infra
-from websockets.asyncio.client import connect as connect_async
-from websockets.asyncio.server import serve as serve_async
 from websockets.exceptions import InvalidStatus
 
 from abcd_ns.viewer import guard
-from abcd_ns.viewer.guard.server import guarded
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 
 SECRET = b"the canary sings"
@@ -62,35 +58,21 @@ def canary(tmp_path: Path) -> Path:
     return path
 
 
-def paths_to(canary: Path) -> list[str]:
-    up = "/.." * 20
-    return [
-        f"{up}{canary}",
-        f"/assets{up}{canary}",
-        f"{up.replace('.', '%2e')}{canary}",
-        f"{up.replace('/', '%2f')}{canary}",
-        f"{up.replace('/', chr(92))}{canary}".replace("/", "\\"),
-        f"/{up}{canary}",
-        f"/{canary}",
-        f"{up}{canary}?x",
-        f"/%00{canary}",
-    ]
+UP = "/.." * 20
+"""From any folder to the root."""
 
 
 def test_no_path_leads_to_a_file_outside(server, canary):
-    for path in paths_to(canary):
-        answer = ask(server, path)
-        assert SECRET not in answer, path
-        assert status(answer) in (HTTPStatus.FORBIDDEN, HTTPStatus.BAD_REQUEST), path
+    for up in (UP, f"/assets{UP}", UP.replace(".", "%2e"), UP.replace("/", "%2f"), f"/{UP}", "/", "/%00"):
+        answer = ask(server, f"{up}{canary}")
+        assert SECRET not in answer, up
+        assert status(answer) in (HTTPStatus.FORBIDDEN, HTTPStatus.BAD_REQUEST), up
 
 
-@pytest.mark.skipif(
-    not hasattr(_infra, "WebSocketServerProtocol"), reason="viser 1.0.25 refuses such paths itself"
-)
 def test_without_the_guard_the_canary_sings(canary, monkeypatch):
     monkeypatch.setattr(_infra, "websockets", _infra.websockets._original)
     bare = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
-    assert SECRET in ask(bare, paths_to(canary)[0])
+    assert SECRET in ask(bare, f"{UP}{canary}")
     bare.stop()
 
 
@@ -102,15 +84,9 @@ def test_the_page_is_served_and_told_to_stay_at_home(server):
     assert "X-Content-Type-Options: nosniff" in head
 
 
-def test_a_name_that_was_rebound_is_not_answered(server):
-    host = "evil.example"
-    assert status(ask(server, "/", Host=host)) == HTTPStatus.FORBIDDEN
-    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
-    answer = ask(server, "/", Host=host, **upgrade, **{"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="})
-    assert status(answer) == HTTPStatus.FORBIDDEN
-
-
-def test_a_foreign_pages_websocket_is_not_opened(server):
+def test_strangers_are_not_answered(server):
+    """A name that was rebound, and a websocket of a foreign page."""
+    assert status(ask(server, "/", Host="evil.example")) == HTTPStatus.FORBIDDEN
     with pytest.raises(InvalidStatus) as refused:
         Browser(server, origin="https://evil.example")
     assert refused.value.response.status_code == HTTPStatus.FORBIDDEN
@@ -127,27 +103,19 @@ def test_no_client_opens_a_public_tunnel(server, browser, answers, monkeypatch):
     assert asked.wait(timeout=20)
 
 
-FRAMES = {
-    "text": "hello",
-    "nothing": b"",
-    "noise": bytes(range(256)) * 4,
-    "truncated": msgspec.msgpack.encode(CAMERA)[:-3],
-    "an array that claims 4 G elements": b"\xdd\xff\xff\xff\xff",
-    "nested 100,000 deep": b"\x91" * 100_000,
-    "no map": msgspec.msgpack.encode([1, 2]),
-    "no type": msgspec.msgpack.encode({"wxyz": 1}),
-    "unknown type": msgspec.msgpack.encode({"type": "Evil"}),
-    "a list as type": msgspec.msgpack.encode({"type": ["Evil"]}),
-    "missing fields": msgspec.msgpack.encode({"type": "ViewerCameraMessage"}),
-    "unknown fields": msgspec.msgpack.encode({**CAMERA, "evil": 1}),
-    "NaN": msgspec.msgpack.encode({**CAMERA, "position": [float("nan")] * 3}),
-    "three numbers for four": msgspec.msgpack.encode({**CAMERA, "wxyz": [1.0, 0.0, 0.0]}),
-}
+FRAMES = (
+    *("hello", b"", bytes(range(256)) * 4, msgspec.msgpack.encode(CAMERA)[:-3]),
+    b"\xdd\xff\xff\xff\xff",  # an array that claims 4 G elements
+    b"\x91" * 100_000,  # nested that deep
+    msgspec.msgpack.encode([1, 2]),
+    *({"wxyz": 1}, {"type": "Evil"}, {"type": ["Evil"]}, {"type": "ViewerCameraMessage"}),
+    *({**CAMERA, "evil": 1}, {**CAMERA, "position": [float("nan")] * 3}, {**CAMERA, "wxyz": [1.0, 0.0, 0.0]}),
+)
 
 
-@pytest.mark.parametrize("what", FRAMES)
-def test_a_malformed_frame_changes_nothing(server, browser, answers, what, capfd):
-    browser.send(FRAMES[what])
+def test_malformed_frames_change_nothing(server, browser, answers, capfd):
+    for frame in FRAMES:
+        browser.send(frame)
     assert answers()
     clients = server.get_clients()
     client = clients[max(clients)]
@@ -195,41 +163,3 @@ def test_another_viser_is_not_guarded_and_the_user_told(monkeypatch, capsys):
     monkeypatch.setattr(_infra, "websockets", object())
     assert not guard.install()
     assert "unguarded" in capsys.readouterr().out
-
-
-def test_the_newer_api_of_websockets_is_guarded_by_the_same_rules():
-    frames = []
-
-    async def handler(connection) -> None:
-        frames.append(await connection.recv())
-        await connection.send(b"done")
-
-    def page(connection, request):
-        upgrades = request.headers.get("Upgrade") == "websocket"
-        return None if upgrades else connection.respond(HTTPStatus.OK, "page")
-
-    async def get(port: int, path: str, host: str) -> bytes:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
-        answer = await reader.read()
-        writer.close()
-        return answer
-
-    async def scenario() -> None:
-        port = free_port()
-        serve = guarded(serve_async)
-        async with serve(handler, "127.0.0.1", port, process_request=page):
-            home = await get(port, "/", f"127.0.0.1:{port}")
-            assert status(home) == HTTPStatus.OK
-            assert b"Content-Security-Policy: default-src 'self'" in home
-            assert status(await get(port, "/../etc/passwd", "localhost")) == HTTPStatus.FORBIDDEN
-            assert status(await get(port, "/", "evil.example")) == HTTPStatus.FORBIDDEN
-            with pytest.raises(InvalidStatus):
-                await connect_async(f"ws://127.0.0.1:{port}", origin="https://evil.example")
-            async with connect_async(f"ws://127.0.0.1:{port}") as client:
-                for frame in ("text", b"\xc1", msgspec.msgpack.encode(CAMERA)):
-                    await client.send(frame)
-                assert await client.recv() == b"done"
-
-    asyncio.run(scenario())
-    assert frames == [msgspec.msgpack.encode(CAMERA)]

@@ -43,16 +43,9 @@ def draws_meanwhile(panel: AbcdPanel, event) -> bool:
     [
         (1, LayersDrawn(0, 1, 9), 0.0, True),
         (1, Pruning(1, 9), 0.0, True),
-        (0, LayersDrawn(0, 1, 9), 0.0, False),
+        (0, LayersDrawn(0, 1, 9), 0.0, False),  # to nobody
         (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
-        (1, LayersDrawn(0, 1, 9), 1e6, False),
-    ],
-    ids=[
-        "browsers get a picture while layers are drawn",
-        "and in the final pruning",
-        "nobody",
-        "a step",
-        "once a second at most",
+        (1, LayersDrawn(0, 1, 9), 1e6, False),  # once a second at most
     ],
 )
 def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):

@@ -17,48 +17,36 @@ from abcd_ns.viewer.texts import (
     clock,
     headline,
     memory_table,
-    workers_line,
+    worker_line,
 )
 
 
-def warm_up() -> ActiveVisit:
-    geometry = VisitGeometry(WHOLE, {0: Crop(0, 0, 8, 8)})
-    return ActiveVisit(0, VisitKind.COARSE, geometry, sh_degree=0, steps=10, views=(0,))
-
-
-def statuses(state: RunState, active: tuple[int, ...] = (), blocks: int = 5) -> list[Status]:
-    return [status_of(block, state, active) for block in range(blocks)]
-
-
 def test_a_block_is_untrained_then_active_then_done():
+    def statuses(state: RunState, *active: int) -> list[Status]:
+        return [status_of(block, state, active) for block in range(5)]
+
     state = RunState(views={0: 9, 1: 9, 2: 2, 3: 0})
     state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1), 4: BlockHealth(giants=3)}
     few, none = Status.UNDER_OBSERVED, Status.UNTRAINED  # the last one's share of the epoch was no step
-    assert statuses(state, active=(1,)) == [Status.DONE, Status.ACTIVE, few, few, none]
-    assert statuses(state, active=(0, 3)) == [Status.ACTIVE, none, few, Status.ACTIVE, none]
+    assert statuses(state, 1) == [Status.DONE, Status.ACTIVE, few, few, none]
+    assert statuses(state, 0, 3) == [Status.ACTIVE, none, few, Status.ACTIVE, none]
+    geometry = VisitGeometry(WHOLE, {0: Crop(0, 0, 8, 8)})
+    state.active = ActiveVisit(0, VisitKind.COARSE, geometry, sh_degree=0, steps=10, views=(0,))
+    assert statuses(state) == [Status.WARM_UP] * 5
 
 
-def test_during_the_warm_up_no_block_is_active():
-    state = RunState(active=warm_up(), views={0: 0})
-    assert statuses(state, blocks=2) == [Status.WARM_UP] * 2
-
-
-def test_the_table_gives_each_blocks_last_psnr():
+def test_the_table_has_no_columns_that_nothing_is_known_of():
     rows = [BlockRow(0, Status.DONE, 1234, 15.0, 9), BlockRow(1, Status.UNDER_OBSERVED, 5, None, 1)]
-    table = block_table(rows)
-    assert "| 1 | done | 1,234 | 15.00 | 9 |" in table
-    assert "| 2 | under-observed | 5 | - | 1 |" in table
-
-
-def test_a_table_of_a_finished_run_has_no_empty_columns():
-    rows = [BlockRow(0, Status.DONE, 7, None, None), BlockRow(1, Status.UNTRAINED, 0, None, None)]
-    lines = [
+    assert block_table(rows).splitlines()[2:] == [
+        "| 1 | done | 1,234 | 15.00 | 9 |",
+        "| 2 | under-observed | 5 | - | 1 |",
+    ]
+    finished = [BlockRow(0, Status.DONE, 7, None, None)]
+    assert block_table(finished).splitlines() == [
         "| # | state | Gaussians |",
         "| ---: | --- | ---: |",
         "| 1 | done | 7 |",
-        "| 2 | untrained | 0 |",
     ]
-    assert block_table(rows).splitlines() == lines
 
 
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
@@ -68,14 +56,6 @@ def test_of_many_blocks_the_table_shows_the_urgent_ones():
     shown = [int(line.split("|")[1]) for line in lines if line.startswith("| ") and line[2].isdigit()]
     assert shown == [*range(1, MOST_ROWS - 1), 71, 91]
     assert lines[-1] == "100 blocks: 1 active, 1 under-observed, 98 untrained."
-
-
-def test_what_workers_do_in_words():
-    seen = [WorkerSeen(0, 2, 7, 40, 3, 1, 0.1), WorkerSeen(1, None, 0, 0, 0, 0, 0.0)]
-    assert workers_line(seen).splitlines() == [
-        "Worker 1: block 3, step 7 of 40; 3 visits, replaced 1x  ",
-        "Worker 2: is starting; 0 visits",
-    ]
 
 
 def a_run(step: int, progress: float, price: float = 8.0):
@@ -99,12 +79,11 @@ def test_time_left_is_that_of_steps_and_of_the_final_pruning():
 
 
 def test_words():
-    assert clock(3725.9) == "1:02:05"
-    assert clock(None) == "unknown"
-    assert headline("Block 3, step 4 of 9", 0.25, 90.0) == (
-        "**Block 3, step 4 of 9**  \n25% of the run, 0:01:30 left"
+    waiting = WorkerSeen(1, None, 0, 0, 0, 0, 0.0)
+    assert worker_line(WorkerSeen(0, 2, 7, 40, 3, 1, 0.1)) == (
+        "Worker 1: block 3, step 7 of 40; 3 visits, replaced 1x"
     )
-    assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers", 2**20, 2**32)]).splitlines()[2:] == [
-        "| RAM | 1.5 GiB | 16.0 GiB |",
-        "| layers | 1 MiB | 4.0 GiB |",
-    ]
+    assert worker_line(waiting) == "Worker 2: is starting; 0 visits"
+    assert (clock(3725.9), clock(None)) == ("1:02:05", "unknown")
+    assert headline("Block 3", 0.25, 90.0) == "**Block 3**  \n25% of the run, 0:01:30 left"
+    assert memory_table([("RAM", 3 * 2**29, 2**34)]).splitlines()[2:] == ["| RAM | 1.5 GiB | 16.0 GiB |"]

@@ -9,12 +9,14 @@ from rich.console import Console
 
 from abcd_ns.cli.check.rules import doubts
 from abcd_ns.cli.check.summary import print_summary, summarize
-from abcd_ns.cli.check.survey import Survey, survey
-from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
+from abcd_ns.cli.check.survey import survey
+from abcd_ns.cli.findings import Finding, by_level, error, note, print_findings, warning
+from abcd_ns.cli.paths import check_file
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.prepare import DOWNSCALE
-from abcd_ns.errors import UserError
+from abcd_ns.lab.results.records import encode, write_json
+from abcd_ns.lab.runs.options import check_ranges
 
 SCHEMA = 2
 """Of the JSON file; changes with its fields."""
@@ -48,13 +50,10 @@ def check(*, data: Path, downscale: int | None = None, json: Path | None = None)
         data: Folder with photos and a COLMAP model or a transforms.json, as for `ns-train abcd --data`.
         downscale: Divides the photos' width and height. Left out, no side is over 1600 px, as in training.
         json: Also write what was found into this file.
-
-    Raises:
-        UserError: an option is out of range, or the JSON file cannot be written.
     """
-    if downscale is not None and downscale < 1:
-        raise UserError(f"--downscale is {downscale}; it must be a whole number from 1.")
-    check_json(json)
+    check_ranges({"downscale": downscale})
+    if json is not None:
+        check_file("--json", json)
     report = examine(data, downscale)
     console, levels = Console(), {finding.level for finding in report.findings}
     if report.summary is not None:
@@ -68,7 +67,8 @@ def check(*, data: Path, downscale: int | None = None, json: Path | None = None)
     else:
         verdict = f"{name} is fine: ns-train abcd --data {shlex.quote(name)}{reduced}"
     print_plain(f"\n{verdict}", console)
-    write_report(json, report)
+    if json is not None:
+        write_json(json, encode(report))
     return REFUSED if "error" in levels else 0
 
 
@@ -76,14 +76,9 @@ def examine(data: Path, downscale: int | None = None) -> Report:
     """Everything that can be said of a data set."""
     try:
         found = survey(data, downscale)
-    except InputError as error:
-        refusals = tuple(Finding("error", "input", line) for line in error.lines)
+    except InputError as refused:
+        refusals = tuple(error("input", line) for line in refused.lines)
         return Report(SCHEMA, str(data), downscale, None, refusals)
-    return Report(SCHEMA, str(data), downscale, summarize(found), by_level(findings_of(found)))
-
-
-def findings_of(found: Survey) -> list[Finding]:
-    """What is wrong or doubtful with a scene that can be read: the reader's own notes, then all others."""
-    findings = [Finding("warning", "input", note) for note in found.prepared.notes]
-    findings += [Finding("note", "input", note) for note in found.prepared.chosen]
-    return [*findings, *doubts(found)]
+    own = [warning("input", said) for said in found.prepared.notes]
+    own += [note("input", said) for said in found.prepared.chosen]
+    return Report(SCHEMA, str(data), downscale, summarize(found), by_level([*own, *doubts(found)]))

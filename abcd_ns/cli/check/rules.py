@@ -1,10 +1,10 @@
 """What is wrong or doubtful about a scene that can be read."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
-from abcd_ns.cli.check.survey import Look, Survey
+from abcd_ns.cli.check.survey import Survey
 from abcd_ns.cli.findings import Finding, error, note, warning
 from abcd_ns.cli.terminal import few
 from abcd_ns.data import OPTION
@@ -35,12 +35,6 @@ def doubts(s: Survey) -> Iterator[Finding]:
     yield from _of_points(s)
 
 
-def _named(names: Iterable[str]) -> tuple[int, str]:
-    """How many there are, and the first of them in words."""
-    names = list(names)
-    return len(names), few(names)
-
-
 def _of_the_set(s: Survey) -> Iterator[Finding]:
     if len(s.names) < FEW_PHOTOS or len(s.train) < 2:
         yield warning(
@@ -53,7 +47,7 @@ def _of_the_set(s: Survey) -> Iterator[Finding]:
     if s.copies:
         held_out = set(s.held_out)
         leaks = sum(0 < len(held_out & set(rows)) < len(rows) for rows in s.copies)
-        _, names = _named(" = ".join(s.names[row] for row in rows) for rows in s.copies)
+        names = few([" = ".join(s.names[row] for row in rows) for rows in s.copies])
         both = f" Both trained on and held out: {leaks}." if leaks else ""
         fix = "Keep one of each, and make the model again. A held-out copy makes scores too good."
         yield warning("duplicate-photos", f"Photos that exist under several names: {names}.{both}", fix)
@@ -79,21 +73,20 @@ def _of_the_set(s: Survey) -> Iterator[Finding]:
 
 
 def _of_single_photos(s: Survey) -> Iterator[Finding]:
-    def photos(wanted: Callable[[Look], bool]) -> tuple[int, str]:
-        return _named(name for name, look in zip(s.names, s.looks, strict=True) if wanted(look))
-
+    looks = list(zip(s.names, s.looks, strict=True))
     for look in s.looks:
         if look.error:
             yield error("damaged-photo", look.error)
-    count, names = photos(lambda look: look.error is None and not DARK <= look.brightness <= BRIGHT)
-    if count:
+    blank = [name for name, look in looks if not look.error and not DARK <= look.brightness <= BRIGHT]
+    if blank:
         fix = "Look at them, and leave out those that show nothing."
-        yield warning("blank-photos", f"{count} black or white nearly all over: {names}.", fix)
-    count, names = photos(lambda look: look.orientation != 1)
-    if count:
+        yield warning("blank-photos", f"{len(blank)} black or white nearly all over: {few(blank)}.", fix)
+    turned = [name for name, look in looks if look.orientation != 1]
+    if turned:
         yield note(
             "exif-orientation",
-            f"{count} with an EXIF orientation: {names}. It is not applied, as COLMAP does not apply it.",
+            f"{len(turned)} with an EXIF orientation: {few(turned)}. It is not applied, as COLMAP does not "
+            "apply it.",
             "If another program made the poses and renderings come out turned, save the photos turned and "
             "without EXIF.",
         )
@@ -101,13 +94,12 @@ def _of_single_photos(s: Survey) -> Iterator[Finding]:
 
 def _of_cameras(s: Survey) -> Iterator[Finding]:
     away, usual = _distances(s.centers, 0.75)
-    far = np.flatnonzero(away > FAR_CAMERA * usual) if usual else []
-    count, names = _named(s.names[row] for row in far)
-    if count:
+    far = [s.names[row] for row in np.flatnonzero(away > FAR_CAMERA * usual)] if usual else []
+    if far:
         yield warning(
             "far-cameras",
-            f"{count} far from the other cameras, up to {away.max() / usual:.0f} times as far from the "
-            f"middle: {names}. The scene is scaled until all cameras fit, so the rest of it becomes tiny.",
+            f"{len(far)} far from the other cameras, up to {away.max() / usual:.0f} times as far from the "
+            f"middle: {few(far)}. The scene is scaled until all cameras fit, so the rest of it becomes tiny.",
             "If they are registered wrongly, remove them from the model (`image_deleter` of the program "
             "colmap).",
         )
@@ -147,9 +139,9 @@ def _of_points(s: Survey) -> Iterator[Finding]:
             "one. In transforms.json, ply_file_path must be in the coordinates of the frames.",
         )
     sparse = np.flatnonzero(in_view < FEW_POINTS_IN_VIEW) if in_view.any() else []
-    views, names = _named(f"{s.names[row]} ({in_view[row]:.0f})" for row in sparse)
-    if views:
-        what = f"{views} with fewer than {FEW_POINTS_IN_VIEW} points in the picture: {names}."
+    if len(sparse):
+        names = few([f"{s.names[row]} ({in_view[row]:.0f})" for row in sparse])
+        what = f"{len(sparse)} with fewer than {FEW_POINTS_IN_VIEW} points in the picture: {names}."
         fix = "See whether they are blurred or show little. Without any point they are likely misplaced."
         yield warning("views-with-few-points", f"{what} Their poses may be inexact.", fix)
     away, usual = _distances(s.points, 0.9) if count >= 10 else (np.zeros(1), 0.0)

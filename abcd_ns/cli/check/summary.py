@@ -21,7 +21,7 @@ MIDDLE = (0.05, 0.95)
 def summarize(survey: Survey) -> dict[str, Any]:
     """The numbers of a scene; lengths are in the units of the model, but for `near_plane`."""
     prepared, points = survey.prepared, survey.points
-    sizes = Counter("{} x {}".format(*source.size) for source in survey.sources)
+    sizes = Counter("{} x {}".format(*source.size) for source in prepared.sources)
     lenses = Counter(_in_words(frame.lens) for frame in prepared.scene.frames)
     spread = np.diff(np.quantile(points, MIDDLE, axis=0), axis=0)[0].tolist() if len(points) else []
     return {
@@ -29,7 +29,7 @@ def summarize(survey: Survey) -> dict[str, Any]:
         "photos": len(survey.names),
         "sizes": dict(sizes.most_common()),
         "lenses": dict(lenses.most_common()),
-        "masks": sum(source.mask_path is not None for source in survey.sources),
+        "masks": sum(source.mask_path is not None for source in prepared.sources),
         "alpha": sum(look.alpha for look in survey.looks),
         "points": len(points),
         "train": len(survey.train),

@@ -79,11 +79,6 @@ class Survey:
         """Of the photos."""
         return [frame.name for frame in self.prepared.scene.frames]
 
-    @property
-    def sources(self) -> list[PhotoSource]:
-        """Of the photos."""
-        return self.prepared.sources
-
     @cached_property
     def centers(self) -> np.ndarray:
         """Camera centres float64 [n, 3], model units."""
@@ -99,7 +94,7 @@ class Survey:
         """All photos and masks, decoded."""
         pixels = (
             source.size[0] * source.size[1] * ((4 if look.alpha else 3) + bool(source.mask_path))
-            for source, look in zip(self.sources, self.looks, strict=True)
+            for source, look in zip(self.prepared.sources, self.looks, strict=True)
         )
         return sum(pixels)
 

@@ -1,4 +1,1 @@
-"""`abcd doctor`: whether this machine and environment can train, and what to do where not.
-
-`facts` looks, `rules` judge.
-"""
+"""`abcd doctor`: `facts` looks, `rules` judge."""

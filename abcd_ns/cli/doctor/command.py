@@ -8,9 +8,10 @@ from rich.console import Console
 
 from abcd_ns.cli.doctor.facts import Facts, gather
 from abcd_ns.cli.doctor.rules import findings_of
-from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
+from abcd_ns.cli.findings import Finding, by_level, print_findings
+from abcd_ns.cli.paths import check_file
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.lab.results.records import decode, encode
+from abcd_ns.lab.results.records import decode, encode, write_json
 from abcd_ns.machine import without_home
 from abcd_ns.units import bytes_in_words
 
@@ -43,15 +44,12 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     Args:
         json: Also write everything that was found into this file.
         verbose: Show all versions and notes.
-
-    Raises:
-        UserError: the JSON file cannot be written.
     """
-    check_json(json)
+    if json is not None:
+        check_file("--json", json)
     report = diagnose(gather())
-    console = Console()
-    facts = report.facts
-    details = {**facts.versions, **facts.build_tools, **{name: getattr(facts, name) for name in DETAILS}}
+    facts, console = report.facts, Console()
+    details = facts.versions | facts.build_tools | {name: getattr(facts, name) for name in DETAILS}
     more = {name.replace("_", " "): value or "none" for name, value in details.items() if verbose}
     print_facts(_rows(facts) | more, console)
     shown = [finding for finding in report.findings if verbose or finding.level != "note"]
@@ -63,7 +61,8 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
         notes = f" and {many(left, 'note', 'notes')}" if left else ""
         verdict += f" All versions{notes}: abcd doctor --verbose"
     console.print(f"\n{verdict}", highlight=False)
-    write_report(json, report)
+    if json is not None:
+        write_json(json, encode(report))
     return CANNOT_TRAIN if ill else 0
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from abcd_ns.cli.export.shown import Box, Shown
-from abcd_ns.cli.run_path import find_run
+from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
@@ -59,15 +59,12 @@ def export(
         box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
         frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
             "nerfstudio" has those of the run, its viewer and `ns-export`.
-
-    Raises:
-        UserError: there is no run, it has nothing to show yet, or `out` exists or cannot be written.
     """
     check_request(out, box)
     run = find_run(run, STORE)
     suffix = suffix_of(out, ".ply" if by_block else None)
     to = to_data(run) if frame == "data" else None
-    with stored(run, out) as store:
+    with stored(run) as store:
         scene = Shown(store, to, box)
         counts = {block: n for block in _steps(scene.blocks, "counting") if (n := scene.count(block))}
         if not counts:
@@ -85,45 +82,30 @@ def check_request(out: Path, box: Box | None) -> None:
     """Raises UserError where `out` cannot be made, or `box` holds nothing."""
     if out.exists():
         raise UserError(f"--out {out} exists already; choose another name.")
-    if not out.absolute().parent.is_dir():
-        raise UserError(f"{out.absolute().parent} does not exist; make it first.")
+    check_file("--out", out)
     if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
         raise UserError("--box needs X0 < X1, Y0 < Y1 and Z0 < Z1.")
 
 
 def to_data(run: Path) -> Frame:
-    """From the run's frame back to that of the data.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """From the run's frame back to that of the data; UserError where the file is missing or damaged."""
     path = run / TRANSFORMS
     try:
         found = json.loads(path.read_text())
         matrix = torch.tensor(found["transform"], dtype=torch.float64).reshape(3, 4)
         return Frame(matrix[:, :3], matrix[:, 3], float(found["scale"])).inverse
-    except FileNotFoundError:
-        raise UserError(
-            f"{run} has no {TRANSFORMS}; give the folder of a run, or --frame nerfstudio."
-        ) from None
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} cannot be read ({error}); use --frame nerfstudio.") from None
 
 
 @contextmanager
-def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
-    """The blocks of a run, to be read while `out` is written.
-
-    Raises:
-        UserError: there are none, they cannot be read, or `out` cannot be written.
-    """
+def stored(run: Path) -> Iterator[ParameterStore]:
+    """The blocks of a run; UserError where they cannot be read."""
     try:
         with ParameterStore.open(run / STATE / STORE, read_only=True) as store:
             yield store
     except StoreError as error:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.frames import Frame
@@ -20,6 +20,12 @@ from abcd_ns.run.store import MADE_FOR
 
 Box = tuple[float, float, float, float, float, float]
 """x, y and z of its lower and then of its upper corner."""
+
+
+def inside(box: Box, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Which points lie in the box."""
+    low, high = points.new_tensor(box[:3]), points.new_tensor(box[3:])
+    return ((points >= low) & (points < high)).all(dim=1)
 
 
 def check_trained(store: ParameterStore) -> None:
@@ -108,8 +114,4 @@ class Shown:
         return means.double() if self.to is None else self.to.points(means)
 
     def _kept(self, means: Tensor, opacities: Tensor) -> Bool[Tensor, "n"]:
-        kept = shows(opacities)
-        if self.box is not None:
-            low, high = means.new_tensor(self.box[:3]), means.new_tensor(self.box[3:])
-            kept &= ((means >= low) & (means < high)).all(dim=1)
-        return kept
+        return shows(opacities) if self.box is None else shows(opacities) & inside(self.box, means)

@@ -1,9 +1,10 @@
 """`abcd mesh`: a trained scene's surface as a mesh of triangles."""
 
-import tempfile
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,11 +12,11 @@ import torch
 import tyro
 
 from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
-from abcd_ns.cli.export.shown import Box, check_trained
-from abcd_ns.cli.mesh.depth_maps import draw
+from abcd_ns.cli.export.shown import Box, check_trained, inside
+from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
-from abcd_ns.cli.report.run_folder import pipeline_config, read_settings
-from abcd_ns.cli.run_path import find_run
+from abcd_ns.cli.paths import find_run
+from abcd_ns.cli.report.run_folder import pipeline_config
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import median_depth
@@ -74,44 +75,25 @@ def mesh(
             "nerfstudio" has those of the run, its viewer and `ns-export`.
         depth: Depth of a pixel. "median" is where half of it is covered. "expected" is the mean, which
             floaters in front of a wall move off the wall.
-
-    Raises:
-        UserError: there is no run, it has nothing to show yet, the data is not the run's, there is no
-            surface, or `out` exists or cannot be written.
     """
     _check(out, voxel, box)
-    run = find_run(run, SETTINGS_FILE, STORE)
+    run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
-    wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
-    with stored(run, out) as store:
-        seen = _seen(store, pipeline_config(run, read_settings(run), data))
-        fused, side = _surface(*seen, wanted)
-        with replacing(out) as partial:
-            write_ply(partial, fused)
-    size, (vertices, faces) = out.stat().st_size / 2**20, (len(fused.vertices), len(fused.faces))
-    print(f"{out}: {vertices:,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side:.3g}")
-    tell_rounding(".ply", float(np.abs(fused.vertices).max()), float(np.ptp(fused.vertices, axis=0).max()))
+    keep = partial(_within, box, to) if box else lambda piece: piece
+    with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:
+        maps = _draw(*_seen(store, pipeline_config(run, data)), depth == "median", folder)
+        surface, side = _fuse(maps, voxel and voxel / to.scale, keep)
+        if not len(surface.faces):
+            raise UserError("There is no surface" + (" in this box." if box else " that three views see."))
+        surface = without_specks(surface)
+        vertices = to.points(torch.from_numpy(surface.vertices)).numpy()
+        with replacing(out) as partly:
+            write_ply(partly, replace(surface, vertices=vertices))
+    size, faces = out.stat().st_size / 2**20, len(surface.faces)
+    said = f"{len(vertices):,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side * to.scale:.3g}"
+    print(f"{out}: {said}")
+    tell_rounding(".ply", float(np.abs(vertices).max()), float(np.ptp(vertices, axis=0).max()))
     return 0
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """The options of `mesh`."""
-
-    out: Path
-    voxel: float | None
-    """World units of the run."""
-    box: Box | None
-    to: Frame
-    median: bool
-
-    def within(self, piece: Piece) -> Piece:
-        """The faces whose middles are in the box."""
-        if self.box is None:
-            return piece
-        middles = self.to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
-        low, high = middles.new_tensor(self.box[:3]), middles.new_tensor(self.box[3:])
-        return with_faces(piece, ((middles >= low) & (middles < high)).all(dim=1).numpy())
 
 
 def _check(out: Path, voxel: float | None, box: Box | None) -> None:
@@ -128,32 +110,38 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
         ) from None
 
 
-def _surface(
-    renderer: LayerRenderer, settings: RenderSettings, views: list[View], wanted: Wanted
-) -> tuple[Piece, float]:
-    """The mesh in the frame of the options, and the side of its voxels there."""
+def _within(box: Box, to: Frame, piece: Piece) -> Piece:
+    """The faces whose middles are in the box, which is in the frame `to`."""
+    middles = to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
+    return with_faces(piece, inside(box, middles).numpy())
+
+
+def _draw(
+    renderer: LayerRenderer, settings: RenderSettings, views: list[View], median: bool, folder: str
+) -> DepthMaps:
+    """What the views see, kept in the folder."""
+    maps = DepthMaps(Path(folder))
+    depth = partial(median_depth, renderer, settings=settings) if median else None
+    with ProgressBar("drawing", len(views)) as bar:
+        maps.draw(WholePictures(renderer, settings), views, bar.advance, depth)
+    return maps
+
+
+def _fuse(maps: DepthMaps, voxel: float | None, keep: Callable[[Piece], Piece]) -> tuple[Piece, float]:
+    """The surface, as far as it is kept, and the side of its voxels, in world units of the run."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
-    with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
-        pictures = WholePictures(renderer, settings)
-        median = partial(median_depth, renderer, settings=settings) if wanted.median else None
-        with ProgressBar("drawing", len(views)) as bar:
-            maps = draw(pictures, views, Path(folder), bar.advance, median)
-        footprints = maps.footprints()
-        if not len(footprints):
-            raise UserError("There is no surface: what the training views show is too transparent.")
-        side = wanted.voxel or VOXEL_PIXELS * float(np.median(footprints))
-        with ProgressBar("looking for surfaces", len(views)) as bar:
-            fusion = Fusion(maps, side, bar.advance)
-        with ProgressBar("fusing", fusion.parts * len(views)) as bar:
-            welded = weld([wanted.within(piece) for piece in fusion.pieces(bar.advance)])
+    footprints, count = maps.footprints(), len(maps.views)
+    if not len(footprints):
+        raise UserError("There is no surface: what the training views show is too transparent.")
+    side = voxel or VOXEL_PIXELS * float(np.median(footprints))
+    with ProgressBar("looking for surfaces", count) as bar:
+        fusion = Fusion(maps, side, bar.advance)
+    with ProgressBar("fusing", fusion.parts * count) as bar:
+        surface = weld([keep(piece) for piece in fusion.pieces(bar.advance)])
     if (far := float((footprints > FAR * side).mean())) > MANY:
         print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
-    if not len(welded.faces):
-        raise UserError("There is no surface" + (" in this box." if wanted.box else " that three views see."))
-    found = without_specks(welded)
-    vertices = wanted.to.points(torch.from_numpy(found.vertices)).numpy()
-    return replace(found, vertices=vertices), side * wanted.to.scale
+    return surface, side
 
 
 def _seen(

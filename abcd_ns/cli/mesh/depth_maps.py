@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.whole_pictures import WholePictures
-from abcd_ns.engine.render import Raster
 from abcd_ns.engine.types import View
 
 LEAST_OPACITY = 0.5
@@ -26,16 +25,29 @@ class DepthMaps:
     folder: Path
     views: list[View] = field(default_factory=list)
 
-    def add(self, view: View, picture: Raster, median: Float[Tensor, "h w"] | None) -> None:
-        """Keep what a view sees: camera z, median or else expected, world units, 0 where it shows too little;
-        and colours."""
-        number, opacity = len(self.views), 1 - picture.transmittance
-        depth = picture.depth / opacity.clamp_min(1e-6) if median is None else median
-        depth = torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
-        color = picture.color / opacity.clamp_min(LEAST_OPACITY)[..., None]
-        np.save(self._file("depth", number), depth.float().cpu().numpy())
-        np.save(self._file("color", number), (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
-        self.views.append(view)
+    def draw(
+        self,
+        pictures: WholePictures,
+        views: Sequence[View],
+        advance: Callable[[], None],
+        median: Callable[[View], Float[Tensor, "h w"]] | None = None,
+    ) -> None:
+        """Draw and keep what the views see, as many at a time as there is room for.
+
+        Kept are camera z, world units, 0 where a view shows too little; and colours.
+
+        Args:
+            median: draws a view's median depth, to be taken in the expected one's place.
+        """
+        for view, picture in zip(views, pictures.draw(views), strict=True):
+            number, opacity = len(self.views), 1 - picture.transmittance
+            depth = median(view) if median else picture.depth / opacity.clamp_min(1e-6)
+            depth = torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
+            color = (picture.color / opacity.clamp_min(LEAST_OPACITY)[..., None]).clamp(0, 1)
+            np.save(self._file("depth", number), depth.float().cpu().numpy())
+            np.save(self._file("color", number), (color * 255).round().to(torch.uint8).cpu().numpy())
+            self.views.append(view)
+            advance()
 
     def depth(self, number: int) -> np.ndarray:
         """float32 [h, w] of the view at this place of `views`."""
@@ -56,22 +68,3 @@ class DepthMaps:
 
     def _file(self, what: str, number: int) -> Path:
         return self.folder / f"{what}-{number:06d}.npy"
-
-
-def draw(
-    pictures: WholePictures,
-    views: Sequence[View],
-    folder: Path,
-    advance: Callable[[], None],
-    median: Callable[[View], Float[Tensor, "h w"]] | None = None,
-) -> DepthMaps:
-    """Draw the views, as many at a time as there is room for, into files of `folder`.
-
-    Args:
-        median: draws a view's median depth, to be taken in the expected one's place.
-    """
-    maps = DepthMaps(folder)
-    for view, picture in zip(views, pictures.draw(views), strict=True):
-        maps.add(view, picture, median and median(view))
-        advance()
-    return maps

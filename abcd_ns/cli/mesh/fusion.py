@@ -62,8 +62,6 @@ class Fusion:
         self.parts = max(1, -(-len(self._boxes) // part_boxes))
         """In how many parts space is fused."""
         self._tree = build_kd(self._centers(self._boxes), self.parts)
-        self.most_boxes = 0
-        """In RAM at the same time, so far."""
 
     def pieces(self, advance: Callable[[], None]) -> Iterator[Piece]:
         """The surface, part by part; `advance` is called for each view of each part."""
@@ -72,7 +70,6 @@ class Fusion:
             around = self._tree.cell(part).grown(1.25 * BOX * self._voxel)
             count = int(around.contains(self._centers(self._boxes)).sum())
             grid = self._grid(max(count, 1))
-            self.most_boxes = max(self.most_boxes, count)
             for number, view in enumerate(self._maps.views):
                 boxes = self._seen[number][around.contains(self._centers(self._seen[number])).numpy()]
                 if len(boxes):

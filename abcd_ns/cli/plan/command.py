@@ -15,7 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from abcd_ns import methods
-from abcd_ns.cli.plan.forecast import Forecast, in_words, shares_of, time_steps
+from abcd_ns.cli.plan.forecast import Forecast, Wanted, in_words, shares_of, time_steps
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
@@ -23,29 +23,12 @@ from abcd_ns.engine.train.memory import levels_of, needs_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.options import Number, check_ranges
+from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.run.fit import Demand, Fit, blocks_to_begin_with, device_budget, find_fit
 from abcd_ns.units import bytes_in_words
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a run is to be like."""
-
-    blocks: Number = 0
-    """Number of blocks. 0 takes as few as the device's budget permits."""
-    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
-    """Memory of the device that training may take. 0 takes 90% of a GPU's free memory, or a quarter of the
-    RAM on a CPU."""
-    max_gaussians: Number = 0
-    """Limit on Gaussians in the scene. 0 sets none; the forecast is five for each point."""
-    steps: Number = 30_000
-    """Steps of the run."""
-    workers: Number = 1
-    """Blocks trained at once, each by a process on its own GPU or on a part of the cores."""
 
 
 @tyro.conf.configure(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
@@ -71,9 +54,6 @@ def plan(
 
     Returns:
         0; 1 if something would not fit.
-
-    Raises:
-        UserError: the data cannot be used, or an option is out of range.
     """
     if not 0 <= wanted.blocks <= MAX_BLOCKS:
         raise UserError(f"--blocks is {wanted.blocks}; it must lie between 0 and {MAX_BLOCKS}.")
@@ -99,14 +79,9 @@ class Capture:
 
 
 def read(data: Path, downscale: int | None, console: Console) -> Capture:
-    """The training views and the points, as training has them; photos are looked at, not decoded.
-
-    Raises:
-        InputError: training would refuse them.
-    """
+    """The training views and the points, as training has them; photos are looked at, not decoded."""
     parser = AbcdDataParserConfig(downscale_factor=downscale)
     config = AbcdDataManagerConfig(data=data, dataparser=parser)
-
     with console.status("Reading the capture"):
         manager = config.setup(device="cpu", test_mode="val")
         dataset = manager.train_dataset
@@ -121,11 +96,7 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
 
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
-    """Cut the points into blocks, and time a step.
-
-    Raises:
-        UserError: the device's budget has no room for any block.
-    """
+    """Cut the points into blocks, and time a step; UserError where the device has no room for any block."""
     points, views = capture.points, capture.views
     training = methods.abcd.config.pipeline.training
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -147,8 +118,9 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         seconds = time_steps(gaussians, spread, training, batch)
     photo_bytes = sum(3 * view.full.pixels for view in views)
     return Forecast(
+        wanted=wanted,
+        factor=capture.factor,
         fit=fit,
-        points=len(points),
         batch=batch,
         points_of_block=tuple(counts.tolist()),
         shares=shares_of(fit, needs, photo_bytes, wanted.workers),
@@ -157,10 +129,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
             "RAM": psutil.virtual_memory().available,
             "disk": shutil.disk_usage(Path.cwd()).free,
         },
-        steps=wanted.steps,
         seconds_per_step=seconds,
-        workers=wanted.workers,
-        factor=capture.factor,
     )
 
 
@@ -181,11 +150,13 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     views = f"up to {most}" if found.batch > 1 else most
     rows = {
         "blocks": f"{fit.blocks}{at_the_end}",
-        "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
-        "time": f"{in_words(low)} to {in_words(high)}: {found.steps:,} steps of {views}",
+        "Gaussians": f"{sum(found.points_of_block):,} points to begin with, {fit.gaussians:,} expected",
+        "time": f"{in_words(low)} to {in_words(high)}: {found.wanted.steps:,} steps of {views}",
     }
-    if found.workers > 1:
-        rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device below"
+    if found.wanted.workers > 1:
+        rows["workers"] = (
+            f"{found.wanted.workers}, each with as much of a GPU, or of the RAM, as the device below"
+        )
     for place, shares in found.shares.items():
         free = f", {bytes_in_words(found.free[place])} may be taken" if place in found.free else ""
         rows[place] = f"{bytes_in_words(sum(shares.values()))} at most{free}"

@@ -2,8 +2,10 @@
 
 import time
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+import tyro
 
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.render import Shot, make_rasterizer
@@ -12,6 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.lab.runs.options import Number
 from abcd_ns.run.fit import Fit, RamShares
 from abcd_ns.units import bytes_in_words
 
@@ -32,35 +35,46 @@ LAYERS_BY_STEPS = 0.15
 """Time for layers by the time of steps: they take 10 to 18% of runs on a CPU (docs/results)."""
 
 
-Shares = dict[str, int]
-"""Bytes, by what takes them."""
+@dataclass(frozen=True)
+class Wanted:
+    """What a run is to be like."""
+
+    blocks: Number = 0
+    """Number of blocks. 0 takes as few as the device's budget permits."""
+    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
+    """Memory of the device that training may take. 0 takes 90% of a GPU's free memory, or a quarter of the
+    RAM on a CPU."""
+    max_gaussians: Number = 0
+    """Limit on Gaussians in the scene. 0 sets none; the forecast is five for each point."""
+    steps: Number = 30_000
+    """Steps of the run."""
+    workers: Number = 1
+    """Blocks trained at once, each by a process on its own GPU or on a part of the cores."""
 
 
 @dataclass(frozen=True)
 class Forecast:
     """All that `abcd plan` prints."""
 
-    fit: Fit
-    points: int
-    batch: int
-    points_of_block: tuple[int, ...]
-    shares: dict[str, Shares]
-    """By place, see `shares_of`."""
-    free: dict[str, int]
-    """Bytes that may be taken there."""
-    steps: int
-    seconds_per_step: float
-    """Measured with the initial points."""
-    workers: int
+    wanted: Wanted
     factor: int
     """By which the photos' width and height are divided."""
+    fit: Fit
+    batch: int
+    points_of_block: tuple[int, ...]
+    shares: dict[str, dict[str, int]]
+    """Bytes by place and by what takes them, see `shares_of`."""
+    free: dict[str, int]
+    """Bytes that may be taken there."""
+    seconds_per_step: float
+    """Measured with the initial points."""
 
     @property
     def hours(self) -> tuple[float, float]:
         """Of the whole run: with as many Gaussians as points, and with as many as are expected."""
         layers = 1 + LAYERS_BY_STEPS * (self.fit.blocks_at_the_end > 1)
-        low = self.steps * self.seconds_per_step * layers / 3600
-        return low, low * max(self.fit.gaussians / max(self.points, 1), 1.0)
+        low = self.wanted.steps * self.seconds_per_step * layers / 3600
+        return low, low * max(self.fit.gaussians / max(sum(self.points_of_block), 1), 1.0)
 
     @property
     def warnings(self) -> list[str]:
@@ -90,7 +104,7 @@ def in_words(hours: float) -> str:
     return f"{hours * 60:.0f} min" if hours < 2 else f"{hours:.0f} h"
 
 
-def shares_of(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> dict[str, Shares]:
+def shares_of(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> dict[str, dict[str, int]]:
     """What a run takes at most, by place of PLACES; and, with workers, what moves for a visit by one.
 
     RAM is beside Python and torch. A worker's machine caches what it was sent until that changes.
@@ -136,10 +150,7 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
     best = float("inf")
     for step in range(TIMED_STEPS):
         began = clock()
-        shots = [
-            Shot(view, part_to_draw(training, view.full, step, place))
-            for place, view in enumerate(views[:batch])
-        ]
+        shots = [Shot(v, part_to_draw(training, v.full, step, k)) for k, v in enumerate(views[:batch])]
         rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
         losses = [
             photometric_loss(

@@ -52,9 +52,6 @@ def poses(
 
     Returns:
         0; 1 if fewer than half of the photos have a pose.
-
-    Raises:
-        UserError: there are no photos, a model is there already, or no two photos match.
     """
     photos = data / "images"
     names, sizes = _look(photos)
@@ -64,8 +61,8 @@ def poses(
     if lens not in lenses:
         raise UserError(f"--lens {lens} is no camera model of COLMAP's: {', '.join(lenses)}.")
     console, notes = Console(), _unread(photos)
-    one_lens = not several_lenses and len(sizes) == 1
-    if not several_lenses and not one_lens:
+    if not several_lenses and len(sizes) > 1:
+        several_lenses = True
         notes.append(f"Photos of {len(sizes)} sizes: assuming several lenses.")
     if order == "any" and len(names) > MANY:
         notes.append(
@@ -73,26 +70,24 @@ def poses(
         )
     for line in notes:
         print_plain(line, console)
-    model = _model(data, Task(photos, names, data / WORK, lens, one_lens, order, seed), console)
+    model = _model(data, Task(photos, names, data / WORK, lens, not several_lenses, order, seed), console)
     return _report(data, names, model, console)
 
 
 def _model(data: Path, task: Task, console: Console) -> Model:
     """The model that is found, put in its place."""
+    shutil.rmtree(task.work, ignore_errors=True)
+    task.work.mkdir()
     try:
-        shutil.rmtree(task.work, ignore_errors=True)
-        task.work.mkdir()
         model = find_poses(task, console)
         if model is None:
             why = "They need to overlap, and to be taken from different places."
             raise UserError(f"No two photos in {task.photos} match. {why}")
         (data / "sparse").mkdir()
         os.replace(model.folder, data / "sparse" / "0")
-    except OSError as error:
-        raise UserError(f"{data} cannot be written to: {error.strerror}.") from None
+        return model
     finally:
         shutil.rmtree(task.work, ignore_errors=True)
-    return model
 
 
 def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:

@@ -1,4 +1,1 @@
-"""`abcd report`: one training run as one HTML page.
-
-`run_folder` reads a run and trusts none of it, `page` fills a template with what the others make.
-"""
+"""`abcd report`: `run_folder` reads a run without trust, `page` puts what the others make into HTML."""

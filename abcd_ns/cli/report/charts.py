@@ -135,7 +135,7 @@ def smoothed(points: np.ndarray) -> np.ndarray:
 
 def _over_time(axes: Axes, story: Story, what: str) -> Axes:
     """With time across, and dashed lines where a run was resumed."""
-    axes.set(xlabel="training time (s)", ylabel=what, xlim=(0, max(story.seconds, 1e-3)))
+    axes.set(xlabel="training time (s)", ylabel=what, xlim=(0, max(story.end.seconds, 1e-3)))
     lay_grid(axes)
     for line in story.of(TrainingLine)[1:]:
         axes.axvline(line.seconds, color=QUIET, linewidth=0.8, linestyle="--")

@@ -8,10 +8,10 @@ import tyro
 from rich.console import Console
 
 from abcd_ns import __version__
+from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.cli.report.held_out import look_at_held_out
 from abcd_ns.cli.report.page import GENERATOR, render_page
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
-from abcd_ns.cli.run_path import find_run
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
@@ -42,9 +42,6 @@ def report(
             a run from elsewhere could name any folder, and the page would show its content.
         out: File of the page. Default: report.html in the run's folder.
         pictures: Number of held-out views to show, from the best to the worst.
-
-    Raises:
-        UserError: `run` is no run, something in it is damaged, or `out` is another file.
     """
     check_ranges({"pictures": pictures})
     folder = find_run(run, SETTINGS_FILE)
@@ -54,18 +51,14 @@ def report(
     held_out, cameras, notes = None, [], _notes(found, data)
     if data is not None and found.checkpoint is not None:
         try:
-            pipeline = load_pipeline(found, found.checkpoint, data)
+            pipeline = load_pipeline(found, data)
             sets = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
             cameras = [each.cameras for each in sets]
             held_out = look_at_held_out(pipeline, pictures, console)
         except UserError as error:  # photos may go missing until they are read
             notes.append(f"Held-out views could not be drawn. {error}")
     page = render_page(found, held_out, cameras, notes)
-    try:
-        # A file's name may have bytes that are no text.
-        out.write_bytes(page.encode("utf-8", "backslashreplace"))
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
+    out.write_text(page, "utf-8", "backslashreplace")  # a file's name may have bytes that are no text
     for note in notes:
         print_plain(note, console, "yellow")
     print_plain(f"{out} ({out.stat().st_size / 2**20:.1f} MiB)", console)
@@ -74,14 +67,9 @@ def report(
 
 def _check_page(out: Path) -> None:
     """Whether the page may be written there: over nothing, or an earlier page of this command."""
-    if not out.parent.is_dir():
-        raise UserError(f"{out.parent} does not exist; give an existing folder.")
-    if out.is_dir():
-        raise UserError(f"--out {out} is a folder; name a file.")
-    if out.exists():
-        with open(out, "rb") as file:
-            if f'content="{GENERATOR} '.encode() not in file.read(2048):
-                raise UserError(f"--out {out} is no page of this command; name another file.")
+    check_file("--out", out)
+    if out.exists() and f'content="{GENERATOR} '.encode() not in out.read_bytes()[:2048]:
+        raise UserError(f"--out {out} is no page of this command; name another file.")
 
 
 def _notes(run: RunFolder, data: Path | None) -> list[str]:
@@ -91,10 +79,10 @@ def _notes(run: RunFolder, data: Path | None) -> list[str]:
         notes.append(f"The run is of abcd_ns {one_line(version)}; the defaults are those of {__version__}.")
     if run.checkpoint is None:
         return [*notes, "There is no checkpoint yet, and so no held-out views and no map."]
-    if run.checkpoint.step < run.story.step:
+    if run.checkpoint.step < run.story.end.step:
         notes.append(
             f"Pictures and blocks are those of the checkpoint at step {run.checkpoint.step:,}; the log "
-            f"goes on to step {run.story.step:,}."
+            f"goes on to step {run.story.end.step:,}."
         )
     if data is None:
         given = one_line(shlex.quote(run.settings.data_path))

@@ -32,7 +32,7 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[Tile]:
     else:  # the log's last
         psnr, ssim = (story.held_out[-1].psnr, story.held_out[-1].ssim) if story.held_out else (None, None)
     layers = f", {story.layer_share:.0%} of the time for layers" if story.layer_share else ""
-    taken = f"{story.seconds:.1f} s" if story.seconds < 100 else clock(story.seconds)
+    taken = f"{story.end.seconds:.1f} s" if story.end.seconds < 100 else clock(story.end.seconds)
     ram, device = _peaks(run)
     of = f"of {machine.ram_bytes / GIB:.0f} GiB"
     memory = ("peak RAM", ram, of)
@@ -41,7 +41,7 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[Tile]:
     return [
         ("held-out PSNR", known(psnr, "{:.2f} dB"), f"SSIM {known(ssim, '{:.3f}')}"),
         ("Gaussians", f"{story.gaussians:,}", "" if limit is None else f"limit {limit:,}"),
-        ("training time", taken, f"{story.step:,} steps{layers}"),
+        ("training time", taken, f"{story.end.step:,} steps{layers}"),
         memory,
     ]
 

@@ -63,31 +63,22 @@ class RunFolder:
 
 
 def open_run(path: Path) -> RunFolder:
-    """Read a run's settings, log, newest checkpoint and state.
-
-    Raises:
-        UserError: something in the folder is missing, damaged or of another version.
-    """
-    settings, story = read_settings(path), read_story(path / STATE / LOG_FILE)
+    """Read a run's settings, log, newest checkpoint and state; UserError where one cannot be read."""
+    settings, story = _read_settings(path), read_story(path / STATE / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
     if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
         story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
     return RunFolder(path, settings, story, checkpoint, _read_state(path / STATE / STORE, checkpoint))
 
 
-def read_settings(path: Path) -> Settings:
-    """What a run was trained with; UserError where that cannot be read."""
-    return read_record(path / STATE / SETTINGS_FILE, Settings, SCHEMA)
-
-
-def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
-    """The trained model with its data, for drawing.
+def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
+    """The trained model of the checkpoint with its data, for drawing.
 
     Raises:
         UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
             this version.
     """
-    config = pipeline_config(run.path, run.settings, data)
+    config, checkpoint = pipeline_config(run.path, data), run.checkpoint
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline = config.setup(device=device, test_mode="test")
     pipeline.eval()
@@ -100,7 +91,7 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPip
     return pipeline
 
 
-def pipeline_config(run: Path, settings: Settings, data: Path) -> AbcdPipelineConfig:
+def pipeline_config(run: Path, data: Path) -> AbcdPipelineConfig:
     """The options that a run was trained with, for the photos in `data`.
 
     Args:
@@ -110,12 +101,18 @@ def pipeline_config(run: Path, settings: Settings, data: Path) -> AbcdPipelineCo
     Raises:
         UserError: an option leads out of `data`, or is none of this version.
     """
-    config, where, prefix = registered_config(settings).pipeline, _settings_file(run, settings), "pipeline."
-    options = {name: value for name, value in settings.options.items() if name.startswith(prefix)}
-    set_options(config, {name.removeprefix(prefix): value for name, value in options.items()}, where)
+    settings, prefix = _read_settings(run), "pipeline."
+    where = _settings_file(run, settings)
+    options = {n.removeprefix(prefix): v for n, v in settings.options.items() if n.startswith(prefix)}
+    config = registered_config(settings).pipeline
+    set_options(config, options, where)
     _check_paths(options, data, where)
     config.datamanager.data = data
     return config
+
+
+def _read_settings(run: Path) -> Settings:
+    return read_record(run / STATE / SETTINGS_FILE, Settings, SCHEMA)
 
 
 def _settings_file(run: Path, settings: Settings) -> str:
@@ -129,10 +126,10 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
     """Photos, masks and points are those of `data`, whatever a run's options say."""
     folder = (data if data.is_dir() else data.parent).resolve()
     for name, value in options.items():
-        of_data = name.startswith("pipeline.datamanager.") and not name.endswith(".data")
+        of_data = name.startswith("datamanager.") and not name.endswith(".data")
         if not of_data or not isinstance(value, str):
             continue
-        what = one_line(f"{name} is {value}")
+        what = one_line(f"pipeline.{name} is {value}")
         if "\0" in value:
             raise UserError(f"{where}: {what}, which is no path; correct it there.")
         if not (folder / value).resolve().is_relative_to(folder):

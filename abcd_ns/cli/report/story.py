@@ -1,10 +1,10 @@
 """A run's log, read back: what happened when."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
 import numpy as np
 
 from abcd_ns.lab.results.records import RecordError, decode
@@ -51,14 +51,9 @@ class Story:
         return tuple(line for line in self.of(HeldOutLine) if line.psnr is not None)
 
     @property
-    def step(self) -> int:
-        """The last that is known of."""
-        return self.lines[-1].step
-
-    @property
-    def seconds(self) -> float:
-        """Of training, as far as is known."""
-        return self.lines[-1].seconds
+    def end(self) -> Line:
+        """Up to where the run is known."""
+        return self.lines[-1]
 
     def seconds_at(self, step: int) -> float:
         """Training time at a step, interpolated between the lines."""
@@ -89,12 +84,9 @@ def read_story(path: Path) -> Story:
     Raises:
         RecordError: the file is absent, or a line is none of a log's; the message names it.
     """
-    try:
-        texts = path.read_bytes().decode("utf-8", "replace").split("\n")[:-1]
-    except FileNotFoundError:
-        raise RecordError(f"{path} does not exist; runs of this version of abcd_ns write it.") from None
-    except OSError as error:
-        raise RecordError(f"{path} cannot be read: {error.strerror}.") from None
+    if not path.exists():
+        raise RecordError(f"{path} does not exist; runs of this version of abcd_ns write it.")
+    texts = path.read_bytes().split(b"\n")[:-1]
     story = Story(tuple(_read_line(text, f"{path}, line {row}") for row, text in enumerate(texts, 1)), 0)
     training = story.last(TrainingLine)
     if training is None:
@@ -104,19 +96,15 @@ def read_story(path: Path) -> Story:
     return Story(story.lines, max([training.blocks, *numbers]))
 
 
-def _read_line(text: str, where: str) -> Line:
+def _read_line(text: bytes, where: str) -> Line:
     try:
-        data = json.loads(text, parse_constant=_refuse)
-    except ValueError as error:
+        data = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RecordError(f"{where} is damaged ({error}); remove it to see the rest.") from None
     kind = data.pop("kind", None) if isinstance(data, dict) else None
-    if not isinstance(kind, str) or kind not in KINDS:
+    if kind not in list(KINDS):
         raise RecordError(f"{where} is of the unknown kind {kind!r}; another version of abcd_ns wrote it.")
     line = decode(KINDS[kind], data, where)
     if isinstance(line, TrainingLine) and line.schema != SCHEMA:
         raise RecordError(f"{where} has schema {line.schema}; this version of abcd reads schema {SCHEMA}.")
     return line
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number in JSON")

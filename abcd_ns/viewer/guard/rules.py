@@ -87,7 +87,7 @@ class Rules:
             case "GuiUpdateMessage":
                 # Browsers set values alone; viser would set any attribute of the element.
                 known = isinstance(message.updates, dict) and set(message.updates) == {"value"}
-                element = self.element(getattr(message, "id", None) or message.uuid) if known else None
+                element = self.element(message.id) if known else None
                 return element is not None and fits(element, message.updates["value"])
             case "TransformControlsUpdateMessage":
                 return _is_vector(message.wxyz, 4) and any(message.wxyz) and _is_vector(message.position, 3)
@@ -126,12 +126,11 @@ def fits(element: Any, value: Any) -> bool:
 
 def is_camera(message: Any) -> bool:
     """Whether a camera message describes a camera; nerfstudio's training loop computes with it unseen."""
-    vectors = [getattr(message, name, None) for name in ("wxyz", "position", "look_at", "up_direction")]
-    aspect = getattr(message, "aspect", 1.0)  # viser 1 sends a size instead
-    if not all(map(_is_vector, vectors, (4, 3, 3, 3))) or not _is_vector((message.fov, aspect), 2):
+    vectors = message.wxyz, message.position, message.look_at, message.up_direction
+    if not all(map(_is_vector, vectors, (4, 3, 3, 3))) or not _is_vector((message.fov, message.aspect), 2):
         return False
-    turned = any(abs(x) > 1e-6 for x in vectors[0])
-    return turned and 0 < message.fov < math.pi and ASPECTS[0] <= aspect <= ASPECTS[1]
+    turned = any(abs(x) > 1e-6 for x in message.wxyz)
+    return turned and 0 < message.fov < math.pi and ASPECTS[0] <= message.aspect <= ASPECTS[1]
 
 
 def _is_vector(values: Any, size: int) -> bool:
@@ -150,15 +149,14 @@ def _own_names() -> tuple[str, ...]:
     return own, full, short, f"{short}.local"
 
 
-def content_policy(hosts: Iterable[str]) -> str:
+def content_policy(host: str) -> str:
     """A Content-Security-Policy under which the viewer's page talks to its own server and to nobody else.
 
     viser's page asks a tracker for a script, and nerfstudio's title bar its site for a picture.
     """
-    sockets = " ".join(f"ws://{host} wss://{host}" for host in hosts)
     return (
         "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
-        f"connect-src 'self' data: blob: {sockets}; frame-ancestors 'none'; form-action 'none'"
+        f"connect-src 'self' data: blob: ws://{host} wss://{host}; frame-ancestors 'none'; form-action 'none'"
     )
 
 

@@ -1,15 +1,16 @@
 """Puts the rules in front of every viser server that this process starts."""
 
 import importlib
-import inspect
 import sys
 import warnings
+from collections import ChainMap
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from importlib.metadata import version
 from typing import Any
 
+import msgspec
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
@@ -31,7 +32,7 @@ def install() -> bool:
     """Guard every viser server that is started from now on; harmless when done again.
 
     Returns:
-        Whether they are guarded. If not, a warning was printed: this viser is built otherwise.
+        Whether they are guarded. If not, a warning was printed: this viser is not 0.2.
     """
     importlib.import_module("viser")
     # Its private module: looked up by name, so that another viser costs a warning and no import.
@@ -39,20 +40,16 @@ def install() -> bool:
     package = getattr(infra, "websockets", None)
     if isinstance(package, _Overlay):
         return True
-    if hasattr(infra, "WebSocketServerProtocol") and hasattr(package, "server"):  # viser 0.2
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of the older API, which is viser's choice
-            serve = package.server.serve
-        infra.websockets = _Overlay(package, server=_Overlay(package.server, serve=guarded(serve)))
-    elif hasattr(infra, "ServerConnection") and hasattr(package, "asyncio"):  # viser 1
-        server = _Overlay(package.asyncio.server, serve=guarded(package.asyncio.server.serve))
-        infra.websockets = _Overlay(package, asyncio=_Overlay(package.asyncio, server=server))
-    else:
+    if not hasattr(infra, "WebSocketServerProtocol") or not hasattr(package, "server"):
         CONSOLE.print(
             f"[bold yellow]warning:[/] the viewer is unguarded: viser {version('viser')} is built otherwise "
-            "than the versions that are known. Use --vis tensorboard on a machine that others use, too."
+            "than 0.2. Use --vis tensorboard on a machine that others use, too."
         )
         return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of the older API, which is viser's choice
+        serve = package.server.serve
+    infra.websockets = _Overlay(package, server=_Overlay(package.server, serve=guarded(serve)))
     return True
 
 
@@ -68,44 +65,28 @@ def rules_of(server: Any) -> Rules | None:
 
 
 def _element(server: Any, name: str) -> Any:
-    """The input element of the server's or of a client's GUI by its id."""
-    for gui in (server.gui, *(client.gui for client in server.get_clients().values())):
-        for known in ("_gui_input_handle_from_id", "_gui_input_handle_from_uuid"):  # viser 0.2, viser 1
-            if (element := getattr(gui, known, {}).get(name)) is not None:
-                return element
-    return None
+    """The input element of the server's or of a client's GUI by its id; None if there is none."""
+    guis = (server.gui, *(client.gui for client in server.get_clients().values()))
+    return ChainMap(*(gui._gui_input_handle_from_id for gui in guis)).get(name)
 
 
 def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
-    """`websockets.serve` behind rules for the host it listens on.
+    """`websockets.server.serve` behind rules for the host it listens on."""
 
-    Args:
-        serve: of the older API, where requests are (path, headers) and answers tuples (viser 0.2), or of the
-            newer one, with (connection, request) and responses (viser 1).
-    """
-
-    def start(handler: Any, host: str, port: int, *, process_request: Any = None, **options: Any) -> Any:
+    def start(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
         rules = _rules[port] = Rules(host)
 
-        async def answer(first: Any, second: Any) -> Any:
-            older = isinstance(first, str)
-            path, headers = (first, second) if older else (second.path, second.headers)
+        async def answer(path: str, headers: Any) -> Any:
             if (reason := rules.refusal(path, headers)) is not None:
                 _tell(reason)
-                if older:
-                    return HTTPStatus.FORBIDDEN, {}, REMEDY
-                return first.respond(HTTPStatus.FORBIDDEN, REMEDY.decode())
-            found = None if process_request is None else process_request(first, second)
-            if inspect.isawaitable(found):
-                found = await found
+                return HTTPStatus.FORBIDDEN, {}, REMEDY
+            found = await process_request(path, headers)
             if found is None:
                 return None
-            fields = {"Content-Security-Policy": content_policy(headers.get_all("Host"))}
-            fields["X-Content-Type-Options"] = "nosniff"
-            if older:
-                return found[0], {**found[1], **fields}, found[2]
-            found.headers.update(fields)
-            return found
+            status, fields, content = found
+            policy = content_policy(headers["Host"])
+            fields = {**fields, "Content-Security-Policy": policy, "X-Content-Type-Options": "nosniff"}
+            return status, fields, content
 
         def read(connection: Any) -> Any:
             return handler(_Reader(connection, rules))
@@ -117,7 +98,6 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
 
 def read_message(frame: Any) -> Any:
     """A client's frame as viser's message; None if it is none."""
-    import msgspec
     from viser._messages import Message
 
     if not isinstance(frame, bytes):

@@ -1,12 +1,12 @@
 """A scene with nothing to complain about, and surveys of what it could have been."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from abcd_ns.cli.check.command import findings_of
+from abcd_ns.cli.check.rules import doubts
 from abcd_ns.cli.check.survey import Look, Survey, visibility
 from abcd_ns.cli.findings import Finding
 from tests.data.dataparser_scenes import write_model, write_photos
@@ -26,13 +26,14 @@ def write_sound(folder: Path) -> Path:
     return folder
 
 
-def names(findings: Iterable[Finding]) -> list[str]:
-    return [finding.name for finding in findings]
+def names(found: Survey) -> set[str]:
+    """Of what is doubtful about it."""
+    return {finding.name for finding in doubts(found)}
 
 
 def the(name: str, found: Survey) -> Finding:
     """The one finding of that name."""
-    (finding,) = (finding for finding in findings_of(found) if finding.name == name)
+    (finding,) = (finding for finding in doubts(found) if finding.name == name)
     return finding
 
 
@@ -51,6 +52,6 @@ def changed(found: Survey, pose: Callable | None = None, points: np.ndarray | No
     return replace(found, prepared=prepared, seen=visibility(prepared))
 
 
-def with_looks(found: Survey, *looks: Look) -> Survey:
-    """The survey with other looks at the first photos."""
-    return replace(found, looks=(*looks, *found.looks[len(looks) :]))
+def with_brightness(found: Survey, *brightness: float) -> Survey:
+    """The survey of photos that are so bright."""
+    return replace(found, looks=tuple(map(Look, brightness)))

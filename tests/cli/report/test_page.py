@@ -7,16 +7,15 @@ import re
 import shlex
 from html.parser import HTMLParser
 
-import numpy as np
 import pytest
 import torch
 
-from abcd_ns.cli.report.charts import draw_map, smoothed
+from abcd_ns.cli.report.charts import draw_map
 from abcd_ns.cli.report.figures import block_rows, more_figures, tiles
 from abcd_ns.cli.report.held_out import HeldOut, pick
 from abcd_ns.cli.report.options import changed_options, training_command
 from abcd_ns.cli.report.page import render_page
-from abcd_ns.cli.report.run_folder import CHECKPOINTS, open_run
+from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -54,9 +53,6 @@ class Page(HTMLParser):
         self.texts.setdefault(tag, []).append("")
         self._open.append(tag)
 
-    def handle_startendtag(self, tag, attrs) -> None:
-        self.elements.append((tag, dict(attrs)))
-
     def handle_endtag(self, tag) -> None:
         if tag in self._open:
             while self._open.pop() != tag:
@@ -76,13 +72,19 @@ def page_of(tmp_path, held_out: HeldOut | None = None, notes=(), **settings) -> 
     return text, Page(text)
 
 
+def with_lines(run: RunFolder, *more: str) -> RunFolder:
+    """The run with more lines in its log."""
+    log = write_log(run.path / "longer.jsonl", [*log_lines(), *more])
+    return dataclasses.replace(run, story=read_story(log))
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> tuple[str, Page]:
     """The page of a run, with pictures."""
     return page_of(tmp_path_factory.mktemp("page"), made_up_held_out())
 
 
-def test_the_tiles_and_the_table_say_what_was_measured(shown):
+def test_the_page_says_what_was_measured(shown, tmp_path):
     text, page = shown
     assert page.texts["h1"] == ["made-up"]
     assert page.texts["title"][0] == "made-up · abcd"
@@ -91,17 +93,46 @@ def test_the_tiles_and_the_table_say_what_was_measured(shown):
         assert value in text
     assert "not ended: still running, or interrupted" in text
     assert "2026-01-02 03:04 UTC" in text
+    # Charts and pictures are described; pictures can be compared by keyboard.
+    charts = [image for image in page.all("img") if image.get("class") == "chart"]
+    assert [image["alt"].split(":")[0] for image in charts] == ["Chart", "Charts", "Map of the blocks"]
+    for image in charts:
+        kind, _, content = image["src"].partition(";base64,")
+        assert kind == "data:image/svg+xml"
+        assert b"</svg>" in base64.b64decode(content)
+    assert all(image["alt"] for image in page.all("img"))
+    (slider,) = page.all("input")  # the view that the page opens with is not repeated
+    assert slider["type"] == "range"
+    assert "0000.png" in slider["aria-label"]
+    # Without pictures the last evaluation of the log stands in.
+    assert tiles(made_up_run(tmp_path), None)[0][1] == "24.50 dB"
 
 
-def test_workers_are_counted_where_there_were_any(tmp_path):
+def test_the_page_needs_nothing_else_and_runs_its_own_script_alone(shown):
+    text, page = shown
+    for tag, attributes in page.elements:
+        for name in ("src", "href", "xlink:href", "data", "action", "srcset", "poster"):
+            assert re.match(r"data:|#", attributes.get(name) or "#"), (tag, name)
+    outside = re.sub(r"data:[^\"')]*", "", text)
+    for word in ("@import", "http://", "https://", "fetch(", "XMLHttpRequest", "WebSocket", "url("):
+        assert word not in outside
+    (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
+    digest = base64.b64encode(hashlib.sha256(page.texts["script"][0].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+
+
+def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_any(tmp_path):
     run = made_up_run(tmp_path)
+    shed = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
     ends = [{"worker": 0, "deaths": 1, "waited": 0.25}, {"worker": 1, "deaths": 0, "waited": 0.05}]
-    lines = [*log_lines(), *(line("worker", 40, 16.0, visits=2, **end) for end in ends)]
-    story = read_story(write_log(tmp_path / "workers.jsonl", lines))
-    found = dataclasses.replace(run, story=story)
+    lines = [line("worker", 40, 16.0, visits=2, **end) for end in ends]
+    found = with_lines(run, *lines, line("shed at end", 40, 17.0, **shed))
     assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
-    assert more_figures(found, None)["workers"] == "2, waited 15% of the time, 1 lost"
-    assert "workers" not in more_figures(run, None)
+    figures = more_figures(found, None)
+    assert figures["workers"] == "2, waited 15% of the time, 1 lost"
+    assert figures["pruned at the end"] == "30 (9%), costs 0.04 dB on 5 training views"
+    assert not {"workers", "pruned at the end"} & more_figures(run, None).keys()
 
 
 @pytest.mark.parametrize(("sampled", "ended", "peak"), [(3, 2, "3.00"), (1, 2, "2.00"), (3, None, "3.00")])
@@ -120,13 +151,6 @@ def test_peaks_of_memory_are_those_of_all_processes_of_a_run(tmp_path, sampled, 
     assert f"RAM {peak} GiB" in more
 
 
-def test_without_pictures_the_last_evaluation_of_the_log_stands_in(tmp_path):
-    text, page = page_of(tmp_path, None, ["the photos are gone"])
-    assert "24.50 dB" in page.texts["dd"]
-    assert "the photos are gone" in text
-    assert page.all("input") == []
-
-
 def test_names_are_text_wherever_they_come_from(tmp_path):
     options = {**made_up_settings().options, "pipeline.training.background": HOSTILE, HOSTILE: HOSTILE}
     hostile = {"scene": HOSTILE, "method": HOSTILE, "data": HOSTILE, "options": options}
@@ -139,35 +163,6 @@ def test_names_are_text_wherever_they_come_from(tmp_path):
     assert all(image["src"].startswith("data:") for image in page.all("img"))
 
 
-def test_nothing_is_fetched_from_anywhere(shown):
-    text, page = shown
-    for tag, attributes in page.elements:
-        for name in ("src", "href", "xlink:href", "data", "action", "srcset", "poster"):
-            assert re.match(r"data:|#", attributes.get(name) or "#"), (tag, name)
-    outside = re.sub(r"data:[^\"')]*", "", text)
-    assert "url(" not in re.sub(r"url\(#", "", outside)
-    for word in ("@import", "http://", "https://", "fetch(", "XMLHttpRequest", "WebSocket"):
-        assert word not in outside
-
-
-def test_only_the_pages_own_script_may_run(shown):
-    _, page = shown
-    (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
-    digest = base64.b64encode(hashlib.sha256(page.texts["script"][0].encode()).digest()).decode()
-    assert f"script-src 'sha256-{digest}'" in policy
-    assert "default-src 'none'" in policy
-
-
-def test_charts_stand_in_the_page_as_images_that_are_described(shown):
-    _, page = shown
-    charts = [image for image in page.all("img") if image.get("class") == "chart"]
-    assert [image["alt"].split(":")[0] for image in charts] == ["Chart", "Charts", "Map of the blocks"]
-    for image in charts:
-        kind, _, content = image["src"].partition(";base64,")
-        assert kind == "data:image/svg+xml"
-        assert b"</svg>" in base64.b64decode(content)
-
-
 def test_a_map_needs_no_gaussians_in_every_block(tmp_path):
     """Stacked blocks are seen from the side too."""
     checkpoint = made_up_run(tmp_path).checkpoint
@@ -178,29 +173,13 @@ def test_a_map_needs_no_gaussians_in_every_block(tmp_path):
     assert draw_map(few, []).startswith("data:image/svg+xml")
 
 
-def test_pictures_can_be_compared_by_keyboard_and_are_described(shown):
-    _, page = shown
-    (slider,) = page.all("input")  # the view that the page opens with is not repeated
-    assert slider["type"] == "range"
-    assert "0000.png" in slider["aria-label"]
-    assert all(image["alt"] for image in page.all("img"))
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
-def test_shown_views_reach_from_the_best_to_the_worst(count):
+def test_shown_views_reach_from_the_best_to_the_worst():
     scores = [made_up_score(row, psnr) for row, psnr in enumerate([21.0, 25.0, 23.0, 20.0, 24.0])]
-    found = pick(scores, count)
-    if count == 1:
-        assert found == {2: "median"}
-    else:
-        rows = list(found)
-        assert (rows[0], rows[-1]) == (1, 3)
-        assert (found[1], found[3]) == ("best", "worst")
-        ranks = [scores[row].psnr_merged for row in rows]
-        assert ranks == sorted(ranks, reverse=True)
-    assert len(found) == min(count, 5)
-    assert pick(scores, 0) == {}
-    assert pick([], 3) == {}
+    assert pick(scores, 1) == {2: "median"}
+    assert pick(scores, 2) == {1: "best", 3: "worst"}
+    assert pick(scores, 3) == {1: "best", 2: "median", 3: "worst"}
+    assert list(pick(scores, 7)) == [1, 4, 2, 0, 3]
+    assert pick(scores, 0) == pick([], 3) == {}
 
 
 def test_changed_settings_and_the_command_that_sets_them():
@@ -215,36 +194,9 @@ def test_changed_settings_and_the_command_that_sets_them():
         "ns-train", "abcd", "--data", "my data; rm -rf",
         "--pipeline.max-seconds", "60.0", "--pipeline.blocks", "4",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("method", ["abcd", "abcd-paper", "abcd-monolithic", "abcd-exact"])
-def test_a_method_as_it_is_has_no_changed_settings(method):
-    assert changed_options(made_up_settings(method)) == []
-
-
-def test_an_unknown_method_is_told_without_defaults():
-    settings = made_up_settings("my-own")
-    assert changed_options(settings) == []
-    assert training_command(settings) == "ns-train my-own --data made-up"
-
-
-def test_blocks_say_what_was_pruned_and_how_psnr_rose(tmp_path):
-    state = RunState(health={0: BlockHealth(visits=1, shed=1234), 1: BlockHealth()}, views={0: 4})
-    run = dataclasses.replace(made_up_run(tmp_path), state=state)
-    first, second, third = block_rows(run)
-    assert first[:5] == ("1", "200", "1,234", "4", "1")
-    assert (second[2], third[2]) == ("0", "-")
-    assert (first[7], first[8]) == ("21.00 dB", "trained")
-
-
-def test_a_run_is_read_while_it_commits(tmp_path):
-    scene = random_gaussians(6)
-    tree = build_kd(scene.means, 2)
-    folder = made_up_folder(tmp_path / "run")
-    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
-        store.commit(blocks_at_rest(tree, scene), state=RunState(views={0: 4, 1: 4}).to_json())
-        found = open_run(folder)
-    assert found.state.views == {0: 4, 1: 4}
+    for method in ("abcd", "abcd-paper", "abcd-monolithic", "abcd-exact", "unknown"):
+        assert changed_options(made_up_settings(method)) == []
+    assert training_command(made_up_settings("unknown")) == "ns-train unknown --data made-up"
 
 
 def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
@@ -264,11 +216,15 @@ def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
         assert more_figures(found, None)["blocks"] == str(known)
 
 
-def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):
-    run = made_up_run(tmp_path)
+def test_blocks_say_how_they_were_trained_or_why_not(tmp_path):
+    state = RunState(health={0: BlockHealth(visits=1, shed=1234), 1: BlockHealth()}, views={0: 4})
+    run = dataclasses.replace(made_up_run(tmp_path), state=state)
+    first, second, third = block_rows(run)
+    assert first[:5] == ("1", "200", "1,234", "4", "1")
+    assert (second[2], third[2]) == ("0", "-")
+    assert (first[7], first[8]) == ("21.00 dB", "trained")
     story = dataclasses.replace(run.story, lines=run.story.lines[:6])
-    state = RunState(views={2: 0})
-    rows = block_rows(dataclasses.replace(run, story=story, state=state))
+    rows = block_rows(dataclasses.replace(run, story=story, state=RunState(views={2: 0})))
     assert [row[-1] for row in rows] == ["trained", "not visited yet", "seen by no view, left as it was"]
     jointly = dataclasses.replace(run, story=dataclasses.replace(story, lines=story.lines[:1]))
     assert {row[-1] for row in block_rows(jointly)} == {"trained in every step"}
@@ -276,17 +232,11 @@ def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):
     assert [row[:2] for row in block_rows(without)] == [("1", "-"), ("2", "-"), ("3", "-")]
 
 
-def test_smoothing_keeps_a_straight_line():
-    times, values = smoothed(np.array([[k, 2.0 * k] for k in range(100)]).T)
-    assert len(times) > 90
-    assert values == pytest.approx(2 * times)
-    assert smoothed(np.array([[0.0], [5.0]])).tolist() == [[0.0], [5.0]]
-
-
-def test_what_was_pruned_at_the_end_is_told(tmp_path):
-    shed = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
-    story = read_story(
-        write_log(tmp_path / "log.jsonl", [*log_lines(), line("shed at end", 40, 17.0, **shed)])
-    )
-    figures = more_figures(dataclasses.replace(made_up_run(tmp_path), story=story), None)
-    assert figures["pruned at the end"] == "30 (9%), costs 0.04 dB on 5 training views"
+def test_a_run_is_read_while_it_commits(tmp_path):
+    scene = random_gaussians(6)
+    tree = build_kd(scene.means, 2)
+    folder = made_up_folder(tmp_path / "run")
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
+        store.commit(blocks_at_rest(tree, scene), state=RunState(views={0: 4, 1: 4}).to_json())
+        found = open_run(folder)
+    assert found.state.views == {0: 4, 1: 4}

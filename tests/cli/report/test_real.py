@@ -43,6 +43,14 @@ def copied(trained, tmp_path) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
+def settings_changed(folder: Path, **changes) -> None:
+    """The run's settings, as someone else may have written them."""
+    path = folder / "abcd" / SETTINGS_FILE
+    settings = json.loads(path.read_text())
+    options = settings["options"] | changes.pop("options", {})
+    path.write_text(json.dumps(settings | changes | {"options": options}))
+
+
 class Canary:
     """Unpickled, or made by an unsafe yaml loader, it leaves a file."""
 
@@ -53,56 +61,38 @@ class Canary:
         return os.mkdir, (str(self.path),)
 
 
-def test_a_run_becomes_one_page(trained, tmp_path, capsys):
-    out = tmp_path / "page.html"
-    assert report(trained, data=photos_of(trained), out=out, pictures=2) == 0
-    page = out.read_text()
+def test_a_run_becomes_one_page_that_tells_what_terminal_and_log_tell(trained, copied, capsys):
+    data = ["--data", str(photos_of(trained))]
+    assert cli.main(["report", str(copied / "config.yml"), *data, "--pictures", "0"]) == 0
+    assert "<input" not in (copied / "report.html").read_text()
+    assert cli.main(["report", str(copied), *data, "--pictures", "2"]) == 0  # over its own page
+    page = (copied / "report.html").read_text()
+    assert str(copied / "report.html") in capsys.readouterr().out
     assert page.count('type="range"') == 2
     assert len(re.findall(r'src="data:image/png', page)) == 6
     assert len(re.findall(r"<tr><td>\d</td>", page)) == 3
     assert "--max-num-iterations 36" in page
     assert f"Of {HELD_OUT} held-out views" in page
-    assert str(out) in capsys.readouterr().out
-    assert out.stat().st_size < 1 << 20
-
-
-def test_terminal_log_and_report_tell_the_same_numbers(trained, tmp_path):
-    said = (trained.parents[3] / "said.txt").read_text()
+    assert len(page) < 1 << 20
+    said, story = (trained.parents[3] / "said.txt").read_text(), open_run(trained).story
     summary = (
         r"Trained (\d+) steps .* held-out PSNR ([\d.]+) dB, ([\d,]+) Gaussians, (\d+%) of the time for layers"
     )
     step, psnr, gaussians, share = re.search(summary, said).groups()
     assert f"{HELD_OUT} held out; photos of up to {WIDTH} x {HEIGHT} px." in said
-    story = open_run(trained).story
-    told = (
-        f"{story.step}",
-        f"{story.held_out[-1].psnr:.2f}",
-        f"{story.gaussians:,}",
-        f"{story.layer_share:.0%}",
-    )
-    assert (step, psnr, gaussians, share) == told
-    report(trained, data=photos_of(trained), out=tmp_path / "page.html", pictures=0)
-    page = (tmp_path / "page.html").read_text()
+    assert (step, psnr) == (f"{story.end.step}", f"{story.held_out[-1].psnr:.2f}")
+    assert (gaussians, share) == (f"{story.gaussians:,}", f"{story.layer_share:.0%}")
     for value in (f"{psnr} dB", f"{step} steps, {share} of the time for layers", gaussians):
         assert value in page
 
 
 def test_the_model_that_is_drawn_is_the_one_that_was_trained(trained):
     opened = open_run(trained)
-    pipeline = load_pipeline(opened, opened.checkpoint, photos_of(trained))
+    pipeline = load_pipeline(opened, photos_of(trained))
     saved = torch.load(opened.checkpoint.path, weights_only=True)["pipeline"]
     assert torch.equal(pipeline.model.merged().means, saved["_model.gauss_params.means"])
     assert opened.settings.options["pipeline.blocks"] == pipeline.config.blocks == 3
-    assert opened.checkpoint.step == opened.story.step == 36
-
-
-def test_the_page_lies_in_the_runs_folder_unless_told_otherwise(copied, trained):
-    data = ["--data", str(photos_of(trained))]
-    assert cli.main(["report", str(copied / "config.yml"), *data, "--pictures", "0"]) == 0
-    first = (copied / "report.html").read_text()
-    assert "<input" not in first
-    assert cli.main(["report", str(copied), *data, "--pictures", "1"]) == 0
-    assert "<input" in (copied / "report.html").read_text()
+    assert opened.checkpoint.step == opened.story.end.step == 36
 
 
 def test_no_object_is_made_of_what_a_folder_says(copied, tmp_path):
@@ -130,9 +120,7 @@ def test_where_the_photos_are_gone_the_page_says_so_and_has_the_rest(copied, cap
 
 def test_photos_are_those_of_a_folder_that_the_user_names(trained, copied, tmp_path, capsys):
     """Not of one that the run names: it may come from elsewhere, and the page may be handed on."""
-    path = copied / "abcd" / SETTINGS_FILE
-    settings, photos = json.loads(path.read_text()), photos_of(trained)
-    assert settings["data_path"] == str(photos)
+    photos = photos_of(trained)
     assert report(copied) == 0
     page = (copied / "report.html").read_text()
     assert "<input" not in page
@@ -140,19 +128,11 @@ def test_photos_are_those_of_a_folder_that_the_user_names(trained, copied, tmp_p
     # The run cannot lead out of the folder that is named, either.
     secret = shutil.copytree(photos, tmp_path / "secret")
     for value in (str(secret), "../secret"):
-        options = {**settings["options"], "pipeline.datamanager.dataparser.images_path": value}
-        path.write_text(json.dumps({**settings, "data_path": str(secret), "options": options}))
+        options = {"pipeline.datamanager.dataparser.images_path": value}
+        settings_changed(copied, data_path=str(secret), options=options)
         opened = open_run(copied)
         with pytest.raises(UserError, match=r"images_path is .*secret, outside of .*nothing there is read"):
-            load_pipeline(opened, opened.checkpoint, photos)
-
-
-def settings_changed(folder: Path, **changes) -> None:
-    """The run's settings, as someone else may have written them."""
-    path = folder / "abcd" / SETTINGS_FILE
-    settings = json.loads(path.read_text())
-    options = settings["options"] | changes.pop("options", {})
-    path.write_text(json.dumps(settings | changes | {"options": options}))
+            load_pipeline(opened, photos)
 
 
 def test_nothing_that_a_run_says_steers_the_terminal(trained, copied, capsys):
@@ -175,9 +155,12 @@ def test_nothing_that_a_run_says_steers_the_terminal(trained, copied, capsys):
         settings_changed(copied, versions=versions, **changes)
         opened = open_run(copied)
         with pytest.raises(UserError) as refused:
-            load_pipeline(opened, opened.checkpoint, photos_of(trained))
+            load_pipeline(opened, photos_of(trained))
         assert str(refused.value).isprintable()
         assert shown in str(refused.value)
+    settings_changed(copied, options={"pipeline.training.magic": 1}, reader="abcd-data")
+    with pytest.raises(UserError, match=r"\(written by abcd_ns .*\): there is no option 'training.magic'"):
+        load_pipeline(open_run(copied), Path("wall"))
 
 
 def test_a_run_that_is_still_going_on_has_a_page(copied):
@@ -219,13 +202,6 @@ def test_what_is_damaged_is_named_and_nothing_is_written(copied, spoil, message)
     assert not (copied / "report.html").exists()
 
 
-def test_options_that_this_version_has_not_are_named(copied):
-    settings_changed(copied, options={"pipeline.training.magic": 1})
-    opened = open_run(copied)
-    with pytest.raises(UserError, match=r"\(written by abcd_ns .*\): there is no option 'training.magic'"):
-        load_pipeline(opened, opened.checkpoint, Path("wall"))
-
-
 def test_a_folder_above_the_run_gets_a_hint(trained):
     for place in (trained.parent, trained.parents[2], trained / "nerfstudio_models"):
         with pytest.raises(UserError, match=f"did you mean {trained}"):
@@ -240,8 +216,6 @@ def test_files_of_something_else_are_left_alone(trained, tmp_path):
     assert mine.read_text() == "<p>mine</p>"
     with pytest.raises(UserError, match="is a folder"):
         report(trained, out=tmp_path)
-    with pytest.raises(UserError, match="does not exist"):
-        report(trained, out=tmp_path / "absent" / "page.html")
     with pytest.raises(UserError, match="--pictures is -1"):
         report(trained, pictures=-1)
 
