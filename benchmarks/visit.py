@@ -27,7 +27,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage
-from abcd_ns.run.begin import RunBuilder
+from abcd_ns.run.begin import begin_run
 from abcd_ns.run.options import RunOptions
 from benchmarks.runs import StageClock, print_machine, read_stage
 
@@ -64,9 +64,9 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     options = RunOptions(TrainingConfig(seed=args.seed), blocks=blocks, workers=1)
-    builder = RunBuilder(options, capture.capture(3), device, say=lambda _: None)
     rasterizer, budget = make_rasterizer("auto", device), Budget(seconds=args.seconds)
-    return builder.build(folder / "store", budget, rasterizer, *nothing_live(3, device))
+    live, store, trained_on = nothing_live(3, device), folder / "store", capture.capture(3)
+    return begin_run(options, trained_on, device, store, budget, rasterizer, *live, say=lambda _: None)
 
 
 def run(

@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -173,13 +173,10 @@ class Member:
         return WorkerSeen(self.number, block, self.done, steps, self.visits, self.deaths, share)
 
 
-M = TypeVar("M", bound=Member)
-
-
-class Workers(ABC, Generic[M]):
+class Workers(ABC):
     """Those that train visits."""
 
-    def __init__(self, members: Sequence[M]) -> None:
+    def __init__(self, members: Sequence[Member]) -> None:
         self._members = list(members)
 
     @property
@@ -209,7 +206,7 @@ class Workers(ABC, Generic[M]):
         """Stop those that train; whether that can be done. Harmless when done twice."""
         return not any(member.assignment is not None for member in self._members)
 
-    def resume(self) -> None:
+    def resume(self) -> None:  # noqa: B027 - some stop nobody
         """Let those that were stopped continue; to be called before `wait` and `submit`."""
 
     @abstractmethod
@@ -228,5 +225,5 @@ class Workers(ABC, Generic[M]):
     def close(self) -> None:
         """End them. Harmless when done twice."""
 
-    def _longest_idle(self) -> M:
+    def _longest_idle(self) -> Any:
         return min((m for m in self._members if m.is_idle), key=lambda member: member.free_since)

@@ -81,7 +81,7 @@ class Place(Member):
     """Whether it has said anything: from then on it ends when this process does."""
 
 
-class ForkedWorkers(Workers[Place]):
+class ForkedWorkers(Workers):
     """So many processes at most at a time.
 
     Args:

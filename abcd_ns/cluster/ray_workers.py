@@ -124,7 +124,7 @@ class Remote(Member):
     """When its last question was put, or it was started."""
 
 
-class RayWorkers(Workers[Remote]):
+class RayWorkers(Workers):
     """So many actors of the Ray cluster that this process is connected to; see `connect`.
 
     Args:

@@ -22,6 +22,11 @@ def one_line(text: str) -> str:
     return printable.encode("utf-8", "backslashreplace").decode()
 
 
+def say(text: str, style: str | None = None) -> None:
+    """Print text as it is: what stands in brackets is no markup, and long lines are left to the terminal."""
+    CONSOLE.print(text, style=style, highlight=False, markup=False, emoji=False, soft_wrap=True)
+
+
 def print_error(text: str) -> None:
     """Say on the console what the user can mend."""
     CONSOLE.print(f"[bold red]error:[/] {escape(text)}", soft_wrap=True, highlight=False)

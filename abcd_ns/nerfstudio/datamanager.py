@@ -16,11 +16,10 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch.utils.data import DataLoader
 
 from abcd_ns.data.dataset import AbcdDataset, has_views
-from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.input_errors import InputError, say
 from abcd_ns.engine.events import Event, PhotosWanted
 from abcd_ns.engine.train.step.batch import Batch, Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
@@ -161,7 +160,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         """The held-out photos; looked at one after the other, so none is kept."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         if not has_views(outputs):
-            CONSOLE.print("No held-out view can be used: scores are of the training views.", style="yellow")
+            say("No held-out view can be used: scores are of the training views.", "yellow")
             outputs = self.train_dataparser_outputs
         return self._dataset(outputs, 0)
 
@@ -186,16 +185,12 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self._pixels("image", row, crop).float() / 255
 
     def target(self, sample: Sample) -> Target:
-        """What a sample is trained on where no model is asked: workers have none."""
-        photo, mask = self.shown(sample)
+        """What a sample is trained on: its photo, composited on its background, and its mask."""
+        shot = sample.view.index, sample.source
+        photo = sample.reduced(self.photo(*shot))
         if photo.shape[-1] == 4:  # as splatfacto's model composites
             photo = photo[..., 3:] * photo[..., :3] + (1 - photo[..., 3:]) * sample.background
-        return photo, mask
-
-    def shown(self, sample: Sample) -> Target:
-        """What a sample's crop shows of the photo and of the mask, in the crop's pixels."""
-        shot = sample.view.index, sample.source
-        return sample.reduced(self.photo(*shot)), sample.reduced_mask(self._pixels("mask", *shot))
+        return photo, sample.reduced_mask(self._pixels("mask", *shot))
 
     def read_ahead(self, event: Event) -> None:
         """Begin to read photos that are wanted soon and not on the device; a CPU has its threads busy."""
@@ -226,7 +221,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
-        photos, masks = map(list, zip(*map(self.shown, samples.samples), strict=True))
+        photos, masks = map(list, zip(*map(self.target, samples.samples), strict=True))
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
         if any(mask is not None for mask in masks):
             batch["mask"] = masks

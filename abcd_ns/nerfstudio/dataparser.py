@@ -15,12 +15,11 @@ from nerfstudio.data.dataparsers.base_dataparser import (
 )
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from abcd_ns.data import OPTION
 from abcd_ns.data.dataset import PHOTOS, pinhole_cameras
-from abcd_ns.data.input_errors import InputError, one_line
+from abcd_ns.data.input_errors import InputError, one_line, say
 from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 from abcd_ns.nerfstudio.flags import shown
 
@@ -97,7 +96,7 @@ class AbcdDataParser(DataParser):
 
     def tell(self, note: str) -> None:
         """Say what the user should know but need not repair."""
-        CONSOLE.print(one_line(note), style="yellow", markup=False, emoji=False, soft_wrap=True)
+        say(one_line(note), "yellow")
 
     def rows(self, split: str) -> list[int]:
         """Rows of the prepared scene's lists that belong to a split; see `split_rows`.

@@ -25,6 +25,9 @@ UNUSED_OF_MACHINE = dict.fromkeys(
 )
 """Options of nerfstudio's machine that ABCD has no use for, and why."""
 
+FOLDERS = ("--output-dir", "--render-output-path")
+"""Flags of ns-export and ns-eval that name folders to be written to."""
+
 
 def trains_ours(words: Sequence[str]) -> bool:
     """Whether a command line is `ns-train` with a method of ours."""
@@ -93,6 +96,13 @@ def check_tool(words: Sequence[str]) -> None:
     out = _value(words, "--output-path")
     if tool == "ns-eval" and out and not out.endswith(".json"):
         raise UserError(f"--output-path {out} must end in .json.")
+    folders = [Path(out).parent] if out else []
+    folders += [Path(given) for flag in FOLDERS if (given := _value(words, flag))]
+    for folder in folders:  # the tools fail by a traceback, ns-eval at its end
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{folder} cannot be made ({error.strerror}): choose another folder.") from None
     if (path := _value(words, "--camera-path-filename")) is not None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))

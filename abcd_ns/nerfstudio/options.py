@@ -180,8 +180,9 @@ def refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
     Raises:
         UserError: one is not.
     """
+    defaults = type(config)()
     for name, why in unused.items():
-        if getattr(config, name) != _default(type(config), name):
+        if getattr(config, name) != getattr(defaults, name):
             raise UserError(_no_effect(f"{prefix}{name}", why))
 
 
@@ -234,11 +235,12 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         training.antialiased = True
     if training.light != "none":  # held-out photos have a light of their own, too
         model.color_corrected_metrics = True
+    defaults = type(model)()
     for name, source in MIRRORED.items():
         value = attrgetter(source)(training)
         if name == "rasterize_mode":
             value = "antialiased" if value else "classic"
-        if getattr(model, name) not in (value, _default(type(model), name)):
+        if getattr(model, name) not in (value, getattr(defaults, name)):
             flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
             raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
         setattr(model, name, value)
@@ -246,8 +248,3 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
 
 def _no_effect(option: str, why: str) -> str:
     return f"--{option.replace('_', '-')} has no effect here: {why}."
-
-
-def _default(config: type, name: str) -> Any:
-    (option,) = (option for option in dataclasses.fields(config) if option.name == name)
-    return option.default if option.default_factory is dataclasses.MISSING else option.default_factory()

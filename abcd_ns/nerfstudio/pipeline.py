@@ -10,8 +10,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
-from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.data.input_errors import say
 from abcd_ns.data.ply import GREY
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import random_points
@@ -27,13 +27,13 @@ from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.resuming import RunRequest
 from abcd_ns.nerfstudio.run.run_log import keep_log
+from abcd_ns.nerfstudio.run.settings import write_settings
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import ray_workers
 from abcd_ns.run import STORE
-from abcd_ns.run.begin import Capture, RunBuilder, gaussians_of_cloud
-from abcd_ns.run.fit import RamShares
+from abcd_ns.run.begin import Capture, begin_run, gaussians_of_cloud
+from abcd_ns.run.fit import RamShares, photo_bytes
 from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
@@ -84,10 +84,12 @@ class AbcdPipeline(VanillaPipeline):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Everything exists by now, checkpoint included: begin or resume, and drive the coordinator."""
         trainer = attributes.trainer
-        self.coordinator = self._begin(trainer.run, attributes.optimizers.optimizers)
+        self.coordinator = self._begin(trainer, attributes.optimizers.optimizers)
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
-        log = keep_log(trainer.run, self.datamanager.train_dataset.photos, self.coordinator)
+        write_settings(trainer.config, trainer.asked, trainer.folder)
+        photos, resumed_from = self.datamanager.train_dataset.photos, trainer.resumed_from
+        log = keep_log(self.coordinator, photos, trainer.folder, resumed_from)
         report = ProgressReport(self.coordinator, log.visits)
         self.coordinator.announce.subscribe(report)
         self.coordinator.announce.subscribe(log)
@@ -132,16 +134,12 @@ class AbcdPipeline(VanillaPipeline):
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
-        if self.coordinator is not None:
-            self.coordinator.pause()
-        self.datamanager.take_poses(self.model.poses)
+        self._before_evaluation()
         return super().get_eval_image_metrics_and_images(step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
-        if self.coordinator is not None:
-            self.coordinator.pause()
-        self.datamanager.take_poses(self.model.poses)
+        self._before_evaluation()
         with as_a_command():
             found = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.coordinator is not None:
@@ -157,6 +155,11 @@ class AbcdPipeline(VanillaPipeline):
             check_box(sys.argv, self.model.means)
         self.datamanager.take_poses(self.model.poses)
 
+    def _before_evaluation(self) -> None:
+        if self.coordinator is not None:
+            self.coordinator.pause()
+        self.datamanager.take_poses(self.model.poses)
+
     def _after_step(self) -> None:
         if self._drawn:  # else workers took the step
             self.coordinator.after_step(Rendered.joined(self._drawn), self._errors)
@@ -164,48 +167,45 @@ class AbcdPipeline(VanillaPipeline):
 
     # -- set-up --------------------------------------------------------------------------------------
 
-    def _begin(self, asked: RunRequest, optimizers: dict[str, Any]) -> Trainer:
-        builder = RunBuilder(
-            self.config, self._capture(), self.device, _say, partial(ray_workers, asked.config)
-        )
-        self.datamanager.device_photo_bytes = builder.photo_bytes
-        return builder.build(
-            asked.folder / STORE,
-            Budget(asked.total_steps, self.config.max_seconds),
-            self.model.draws_with(),
-            self.model.gauss_params,
-            {name: optimizers[name] for name in self.model.gauss_params},
-            asked.resumed_from,
+    def _begin(self, trainer: Any, optimizers: dict[str, Any]) -> Trainer:
+        """Begin or resume; from now on the model draws from its near plane on."""
+        manager, model, views = self.datamanager, self.model, self.training_views()
+        model.near = views[0].near
+        manager.device_photo_bytes = photo_bytes(self.config, self.device)
+        first = partial(self._first_gaussians, views)
+        photos, factor = manager.train_dataset.image_filenames, factor_of(manager.dataparser)
+        return begin_run(
+            self.config,
+            Capture(views, photos, manager.target, first, len(self._cloud[0]), factor),
+            self.device,
+            trainer.folder / STORE,
+            Budget(trainer.total_steps, self.config.max_seconds),
+            model.draws_with(),
+            model.gauss_params,
+            {name: optimizers[name] for name in model.gauss_params},
+            say,
+            partial(ray_workers, trainer.config),
+            trainer.resumed_from,
         )
 
     def training_views(self) -> list[View]:
         """The photos' cameras as the scene is trained with them."""
-        points = None if self.model.seed_points is None else self.model.seed_points[0]
-        return training_views(self.datamanager.train_dataset.cameras, points, self.config.near_plane)
+        return training_views(self.datamanager.train_dataset.cameras, self._cloud[0], self.config.near_plane)
 
-    def _capture(self) -> Capture:
-        """What there is to train on; from now on the model draws from its near plane on."""
-        dataset, manager, views = self.datamanager.train_dataset, self.datamanager, self.training_views()
-        self.model.near = views[0].near
-        first = partial(self._first_gaussians, views)
-        points = None if self.model.seed_points is None else self.model.seed_points[0]
-        count, factor = 0 if points is None else len(points), factor_of(manager.dataparser)
-        return Capture(views, dataset.image_filenames, manager.target, first, count, factor)
+    @property
+    def _cloud(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points of the capture and their colours; none where it has none."""
+        return self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
 
     def _first_gaussians(self, views: list[View]) -> Gaussians:
         """At the points of the capture or, as splatfacto's, at random places."""
-        model, training = self.model.config, self.config.training
-        points, colors = self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
+        model, training, (points, colors) = self.model.config, self.config.training, self._cloud
         if len(points) and not model.random_init:
             if len(colors) != len(points):  # as of a .ply without colours
                 colors = torch.full_like(points, GREY)
             return gaussians_of_cloud(points.cpu().float(), colors.cpu(), views, training)
         if not len(points) and not isinstance(self.datamanager.dataparser, AbcdDataParser):  # which says so
             where = "at random places, as splatfacto's do"
-            _say(f"The data has no points: {model.num_random:,} Gaussians begin {where}.")
+            say(f"The data has no points: {model.num_random:,} Gaussians begin {where}.")
         at_random = random_points(model.num_random, model.random_scale)
         return gaussians_of_cloud(*at_random, views, replace(training, point_pixels=0.0))
-
-
-def _say(line: str) -> None:
-    CONSOLE.print(line, highlight=False, soft_wrap=True)

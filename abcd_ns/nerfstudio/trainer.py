@@ -15,9 +15,8 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from abcd_ns.data.input_errors import exit_on_user_error, print_error
+from abcd_ns.data.input_errors import exit_on_user_error, print_error, say
 from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkersSeen
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
@@ -27,7 +26,7 @@ from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_c
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
-from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
+from abcd_ns.nerfstudio.run.resuming import check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume, next_steps
 from abcd_ns.run import STATE, STORE
@@ -117,11 +116,11 @@ class AbcdTrainerConfig(TrainerConfig):
         seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
         steps = f", {self.max_num_iterations:,} steps" if self.max_num_iterations < UNLIMITED_STEPS else ""
         blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
-        CONSOLE.print(f"{what}: {blocks}{steps}{seconds}", highlight=False)
+        say(f"{what}: {blocks}{steps}{seconds}")
 
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
-        with at_once(partial(CONSOLE.print, "Stopped before anything was written.")):
+        with at_once(partial(say, "Stopped before anything was written.")):
             self.check()
         try:
             super().save_config()
@@ -140,13 +139,13 @@ class AbcdTrainerConfig(TrainerConfig):
         if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
             self.machine.device_type = "cpu"
             why = "No CUDA device was found" if device == "cuda" else "MPS devices are not supported"
-            CONSOLE.print(f"{why}: training on the CPU.")
+            say(f"{why}: training on the CPU.")
         with exit_on_user_error():
             start = find_start(self)
             check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
             found = inspect(self.pipeline.datamanager.reader())
-            CONSOLE.print(found.in_words(), highlight=False)
+            say(found.in_words())
             if self.pipeline.blocks == 0:
                 self._check_fit(found)
 
@@ -178,14 +177,14 @@ class AbcdTrainer(Trainer):
         self.total_steps = config.max_num_iterations
         """Steps of the whole run, those before a resume included."""
         config.pipeline.training.seed = config.machine.seed
-        self._options = flat_options(config)
+        self.asked = flat_options(config)
+        """The options as they were asked for, by dotted name: `config` has what follows from them, too."""
         self._signals = StopSignals()
 
     @property
-    def run(self) -> RunRequest:
-        """What the pipeline begins."""
-        folder, steps = self.base_dir / STATE, self.total_steps
-        return RunRequest(self.config, folder, steps, self._options, self.resumed_from)
+    def folder(self) -> Path:
+        """For all that is ours, in the run's folder."""
+        return self.base_dir / STATE
 
     @property
     def training_state(self) -> str:
@@ -219,7 +218,7 @@ class AbcdTrainer(Trainer):
             self._train()
 
     def _say_that_it_ended(self, said: str) -> None:
-        self._say(said)
+        say(said)
         self._log_how_to_resume()
 
     def _train(self) -> None:
@@ -234,7 +233,7 @@ class AbcdTrainer(Trainer):
             name, step = stopped.received.name, self.pipeline.coordinator.state.step
             said = f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost."
             self._say_that_it_ended(said)
-            raise SystemExit(stopped.exit_code) from None
+            raise SystemExit(128 + stopped.received) from None  # as shells expect
         except (UserError, torch.cuda.OutOfMemoryError) as error:
             self._end_report()
             print_error(str(error) if isinstance(error, UserError) else self._memory_is_full())
@@ -257,7 +256,7 @@ class AbcdTrainer(Trainer):
         coordinator = self.pipeline.coordinator
         coordinator.save()
         if coordinator.state.in_flight:
-            self._say("Visits under way are being finished; another Ctrl-C drops them.")
+            say("Visits under way are being finished; another Ctrl-C drops them.")
         if coordinator.await_visits():
             coordinator.save()
 
@@ -303,9 +302,9 @@ class AbcdTrainer(Trainer):
 
     def _log_how_to_resume(self) -> None:
         command = command_to_resume(sys.argv, self.config.method_name, self.checkpoint_dir)
-        if command is None or not has_begun(self.base_dir / STATE / STORE):
+        if command is None or not has_begun(self.folder / STORE):
             return  # the caller knows better, or there is nothing to go on from yet
-        self._say(f"To go on:\n  {command}")
+        say(f"To go on:\n  {command}")
 
     def _say_what_is_next(self) -> None:
         over = self.pipeline.coordinator.finished and self._training_state == "completed"
@@ -313,31 +312,28 @@ class AbcdTrainer(Trainer):
         if over and not self.config.viewer.quit_on_train_completion:
             data = self.config.pipeline.datamanager.reader().data
             method, trainer = self.config.method_name, self.pipeline.coordinator
-            self._say("\n".join(["Next:", *next_steps(trainer, method, data, self.checkpoint_dir)]))
-
-    def _say(self, text: str) -> None:
-        CONSOLE.print(text, highlight=False, markup=False, emoji=False, soft_wrap=True)
+            say("\n".join(["Next:", *next_steps(trainer, method, data, self.checkpoint_dir)]))
 
     # -- checkpoints ---------------------------------------------------------------------------------
 
     def _load_checkpoint(self) -> None:
         start = find_start(self.config)
         if start is None:
-            CONSOLE.print("Training from scratch.")
+            say("Training from scratch.")
             return
         self.resumed_from = start
         self._start_step = start.step
         self.config.max_num_iterations = max(self.total_steps - start.step, 0)
         self.step = start.step - 1
         which = "where it was left" if start.pin is None else start.pin
-        self._say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
+        say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
 
     def _update_viewer_state(self, step: int) -> None:
         """As nerfstudio's, which lets a client that goes away, or sends nonsense, end the run."""
         try:
             super()._update_viewer_state(step)
         except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
-            self._say(f"The viewer failed at step {step} ({error!r}); training goes on.")
+            say(f"The viewer failed at step {step} ({error!r}); training goes on.")
 
     def save_checkpoint(self, step: int) -> None:
         """Save the merged scene for nerfstudio's tools, and everything else in the store.

@@ -5,11 +5,11 @@ from functools import partial
 
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.cluster.assignment import Workers, WorkersError
 from abcd_ns.cluster.connect import check_installed, connect
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
+from abcd_ns.data.input_errors import say
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.errors import UserError
@@ -67,7 +67,7 @@ def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int)
 
     make = partial(make_worker, config, setup, 0 if not on_gpu else int(PHOTO_SHARE * budget))
     workers = RayWorkers(count, make, gpus=int(on_gpu), cores=threads)
-    CONSOLE.print(f"{count} workers are starting.", highlight=False)
+    say(f"{count} workers are starting.")
     try:
         while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
             workers.wait(1.0)

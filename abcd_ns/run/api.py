@@ -24,7 +24,7 @@ from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.run import STATE, STORE
-from abcd_ns.run.begin import Capture, RunBuilder, gaussians_of_cloud
+from abcd_ns.run.begin import Capture, begin_run, gaussians_of_cloud
 from abcd_ns.run.options import RunOptions
 
 LOG = logging.getLogger("abcd_ns")
@@ -90,12 +90,12 @@ def train(
         return gaussians_of_cloud(places, colors, views, training)
 
     names = [Path(str(view.index)) for view in views]
-    builder = RunBuilder(options, Capture(views, names, target, first, len(places)), device, LOG.info)
+    capture = Capture(views, names, target, first, len(places))
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
     live, budget = nothing_live(training.sh_degree, device), Budget(steps, options.max_seconds)
     threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
     try:
-        trainer = builder.build(folder, budget, rasterizer, *live)
+        trainer = begin_run(options, capture, device, folder, budget, rasterizer, *live, LOG.info)
         with closing(trainer):
             if listener is not None:
                 trainer.announce.subscribe(listener)

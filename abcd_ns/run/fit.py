@@ -12,11 +12,12 @@ from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
+from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.machine import threads_wanted
+from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB, bytes_in_words
 
 EXPECTED_GROWTH = 5
@@ -239,6 +240,18 @@ def _least_budget(budget: int, demand: Demand) -> float:
     while _fit(high * step, demand) is None:
         high *= 2
     return bisect_left(range(high), True, low, key=lambda n: _fit(n * step, demand) is not None) / 100
+
+
+def photo_bytes(options: RunOptions, device: torch.device) -> int:
+    """Of the device, for photos. None on a CPU; none beside workers, of which one shares this device."""
+    if device.type == "cpu" or has_workers(options):
+        return 0
+    return int(PHOTO_SHARE * device_budget(options.device_budget_gb, device))
+
+
+def has_workers(options: RunOptions) -> bool:
+    """Whether workers are asked for."""
+    return options.workers > 1 or options.cluster is not None
 
 
 def blocks_to_begin_with(fit: Fit, workers: int) -> int:

@@ -75,11 +75,11 @@ def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos,
     assert alone.state.to_json() | {"seconds": 0} == assigned.state.to_json() | {"seconds": 0}
 
 
-@pytest.mark.parametrize(("lag", "seed"), [(2, 0), (4, 1)])
-def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos, lag, seed):
+def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos):
+    lag = 4
     steady = make("steady", workers=2, lag=lag, density=GROWING)
     train(steady, photos)
-    rng, workers = random.Random(seed), []
+    rng, workers = random.Random(1), []
 
     def fate(assignments):
         return rng.choice(assignments), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
@@ -137,10 +137,9 @@ def test_who_has_a_long_visit_keeps_no_other_from_beginning_the_next(make, photo
     assert heard.index((True, 3)) < heard.index((False, 0))
 
 
-@pytest.mark.parametrize("limit", [0, 24])
-def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
+def test_nobody_who_moves_meanwhile_is_lost(make, photos):
     """Gaussians that come to wait for a block while it is out are there when it is home, though it be cut."""
-    run = make(workers=3, lag=5, density=STILL, steps=90, block_limit=limit)
+    run = make(workers=3, lag=5, density=STILL, steps=90, block_limit=24)
     total, generator = run.count(), torch.Generator().manual_seed(0)
     inner = run.workers.wait
 
@@ -162,7 +161,7 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
         assert run.count() == total
         moved += run.scene.pending is not None and len(run.scene.pending) > 0
     assert moved > 0
-    assert (run.scene.tree.num_blocks > 6) == (limit > 0)
+    assert run.scene.tree.num_blocks > 6
     for block in range(run.scene.tree.num_blocks):
         means = with_pending(run.scene, block).gaussians.means
         assert bool((run.scene.tree.assign(means) == block).all())
@@ -267,11 +266,8 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
     assert run.run.poses.refined == found
 
 
-@pytest.mark.parametrize("stopped_in", ["the warm-up", "a visit"])
-def test_what_was_trained_here_leaves_the_device_before_anything_is_assigned(make, photos, stopped_in):
-    options = {"density": STILL} | (
-        {"coarse_model": 40, "warmup": 0.3} if stopped_in == "the warm-up" else {}
-    )
+def test_what_was_trained_here_leaves_the_device_before_anything_is_assigned(make, photos):
+    options = {"density": STILL, "coarse_model": 40, "warmup": 0.3}
     alone = make("run", **options)
     train(alone, photos, steps=3)
     assert alone.state.active is not None

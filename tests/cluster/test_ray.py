@@ -28,7 +28,7 @@ os.environ.update(RAY_worker_niceness="0")  # niced, as Ray has it, they starve 
 keep_to_ourselves(starts=True)  # before Ray is imported
 ray = pytest.importorskip("ray")
 from ray.cluster_utils import Cluster  # noqa: E402
-from ray.exceptions import ObjectStoreFullError, OutOfDiskError  # noqa: E402
+from ray.exceptions import OutOfDiskError  # noqa: E402
 
 from abcd_ns.cluster import ray_workers  # noqa: E402 - needs Ray
 from abcd_ns.cluster.ray_workers import RayWorkers  # noqa: E402
@@ -107,7 +107,6 @@ def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, assigned, phot
     assert equal(whole_scene(assigned), steady[0])
     assert any(all(worker.block is not None for worker in event.workers) for event in seen)
     assert all(worker.visits > 0 and worker.deaths == 0 for worker in assigned.workers.seen())
-    assert ray.cluster_resources()["object_store_memory"] < 150 << 20
 
 
 def test_workers_that_are_lost_take_nothing_along(steady, assigned, photos, traps):
@@ -129,10 +128,9 @@ def test_workers_that_are_lost_take_nothing_along(steady, assigned, photos, trap
     assert equal(whole_scene(assigned), steady[0])
 
 
-@pytest.mark.parametrize("error", [ObjectStoreFullError, OutOfDiskError])
-def test_where_disk_is_full_too_one_line_says_so(assigned, photos, monkeypatch, error):
+def test_where_disk_is_full_too_one_line_says_so(assigned, photos, monkeypatch):
     def put(_):
-        raise error("no space left on device")
+        raise OutOfDiskError("no space left on device")
 
     monkeypatch.setattr(ray_workers.ray, "put", put)
     with pytest.raises(WorkersError, match=r"no room for a block: no space left.*--object-store-memory"):

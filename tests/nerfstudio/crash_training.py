@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils import writer
 
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.store import crash_points
@@ -31,6 +30,8 @@ def train(
         commit_seconds: as of TrainingConfig.
         options: of the trainer's config.
     """
+    from nerfstudio.utils import writer  # which cannot be the first of nerfstudio's modules
+
     torch.set_num_threads(1)
     writer.EVENT_WRITERS.clear()  # of the process that was forked, whose threads are not here
     if kill is not None:

@@ -101,6 +101,9 @@ REFUSED = {
     "ns-export marching-cubes": "abcd mesh",
     "ns-render spiral": "ns-render interpolate",
     "ns-eval --output-path scores.txt": "scores.txt must end in .json",
+    "ns-eval --output-path broken.json/new/scores.json": "broken.json/new cannot be made .Not a dir",
+    "ns-eval --output-path out/x.json --render-output-path broken.json": "broken.json cannot be made",
+    "ns-export gaussian-splat --output-dir broken.json": "broken.json cannot be made",
     "ns-render camera-path --camera-path-filename none.json": "none.json is no camera path",
     "ns-render camera-path --camera_path_filename=broken.json": "broken.json is no camera path",
 }

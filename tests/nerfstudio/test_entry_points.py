@@ -16,7 +16,7 @@ from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 
 from tests.test_house_rules import PACKAGE_FILES, PYPROJECT
 
-NEEDED = ("viser", "cv2", "fcntl", "safetensors", "pytorch_msssim")
+NEEDED = ("viser", "cv2", "fcntl")
 NOT_NEEDED = ("trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
 
 

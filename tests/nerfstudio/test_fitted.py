@@ -3,7 +3,6 @@
 import torch
 
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.run.fit import Fit
@@ -38,11 +37,3 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     assert max(crop.pixels for crop in crops) <= 600
     found, expected = gaussians(resumed.base_dir), gaussians(straight.base_dir)
     assert all(torch.equal(found[name], value) for name, value in expected.items())
-
-
-def test_an_explicit_crop_is_kept_where_blocks_are_given(data, tmp_path):
-    config = configure(data, tmp_path, steps=4)
-    training = config.pipeline.training
-    training.limits, training.batch = Limits(crop_pixels=700), 1
-    coordinator = run(config).pipeline.coordinator
-    assert (coordinator.config.limits.crop_pixels, coordinator.batch) == (700, 1)

@@ -4,9 +4,7 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
-from abcd_ns import methods
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.nerfstudio.test_training import configure, run
@@ -15,12 +13,9 @@ CLOSE = 5e-4
 """Drawing stops where 1e-4 of the light is left, and a node knows nothing of the others."""
 
 
-@pytest.fixture(scope="module", params=["fragments", "means"])
-def trained(request, data, tmp_path_factory) -> AbcdTrainer:
-    config = configure(data, tmp_path_factory.mktemp("out"), steps=12)
-    config.pipeline.training.recipe = Recipe(ownership=request.param)
-    config.pipeline.model.ownership = request.param
-    return run(config)
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> AbcdTrainer:
+    return run(configure(data, tmp_path_factory.mktemp("out"), steps=12))
 
 
 @pytest.fixture
@@ -79,29 +74,6 @@ def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     assert len(drawn) > len(expected)
 
 
-def test_with_room_for_some_blocks_they_are_drawn_together(trained, monkeypatch, drawn):
-    model = trained.pipeline.model
-    count = len(model.merged())
-    short_of_memory(monkeypatch, int(0.8 * count))
-    some = pictures(trained.pipeline)
-    several = len(drawn)
-    drawn.clear()
-    short_of_memory(monkeypatch)
-    assert_same_pictures(pictures(trained.pipeline), some)
-    assert several < len(drawn)
-
-
-def test_blocks_that_are_all_live_are_drawn_by_nodes_too(data, tmp_path, monkeypatch, drawn):
-    trainer = run(configure(data, tmp_path, methods.abcd_exact, steps=2))
-    drawn.clear()
-    expected, count = pictures(trainer.pipeline), len(trainer.pipeline.model.merged())
-    assert set(drawn) == {count}
-    drawn.clear()
-    short_of_memory(monkeypatch)
-    assert_same_pictures(pictures(trainer.pipeline), expected)
-    assert max(drawn) < count
-
-
 def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):
     """The model's own device has no part in loading it."""
     checkpoint = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)
@@ -112,7 +84,3 @@ def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):
     model = pipeline.model
     assert {value.device.type for value in model.gauss_params.values()} == {"cpu"}
     assert torch.equal(model.means, checkpoint["pipeline"]["_model.gauss_params.means"])
-    assert all(name in model.state_dict() for name in ("gauss_params.means", "gauss_params.quats"))
-    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: 10**9)
-    with pytest.raises(Exception, match="meta"):  # where there is room, it goes there
-        pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])

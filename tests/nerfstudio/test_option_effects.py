@@ -13,16 +13,10 @@ from tests.nerfstudio.test_training import configure, run
 
 CHANGES = {
     "machine.seed": 7,
-    "max_num_iterations": 7,
-    "pipeline.blocks": 3,
     "pipeline.partition": "grid",
     "pipeline.near_plane": 4.44,  # through the wall
     "pipeline.training.point_pixels": 20.0,
     "pipeline.model.random_init": True,
-    "pipeline.datamanager.dataparser.downscale_factor": 2,
-    "pipeline.datamanager.dataparser.eval_mode": "all",
-    "pipeline.datamanager.dataparser.eval_interval": 3,
-    "pipeline.datamanager.dataparser.orientation_method": "pca",
 }
 CHANGES_NOTHING = {"pipeline.ram_budget_gb": 1 / 2**30, "pipeline.training.commit_seconds": 0.0}
 

@@ -75,17 +75,6 @@ def test_a_scene_without_points_begins_at_random_and_says_so(tmp_path, capsys):
     eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
 
 
-def test_faults_of_another_reader_end_a_command_before_anything_is_written(data, tmp_path, capsys):
-    config = configure(data, tmp_path)
-    config.pipeline.datamanager.dataparser = ColmapDataParserConfig()  # which looks in colmap/sparse/0
-    config.set_timestamp()
-    with pytest.raises(SystemExit) as stopped:
-        config.save_config()
-    assert stopped.value.code == 2
-    assert "colmap cannot read" in capsys.readouterr().out
-    assert not any(tmp_path.iterdir())
-
-
 def test_a_question_of_another_reader_without_a_terminal_is_one_line(data, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     parser = ColmapDataParserConfig(data=data, colmap_path=Path("sparse/0"), downscale_factor=2)

@@ -22,18 +22,6 @@ def coordinator(tmp_path):
     return make_coordinator(tmp_path, random_gaussians(40), ring_of_views(3), blocks=3)
 
 
-def test_no_time_is_left_before_a_step_tells_how_long_it_takes(coordinator, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
-    coordinator.run.stopwatch = Stopwatch(0.6)
-    report = ProgressReport(coordinator)
-    report(VisitBegan(0, 0, None, steps=8, views=3, gaussians=40))
-    coordinator.state.step = 1
-    report(StepTaken(1, 0, 1, psnr=20.0))
-    before, after = capsys.readouterr().out.splitlines()
-    assert " left" not in before
-    assert " left  20.00 dB training  " in after
-
-
 def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
     """What matters less is left out."""
     file = io.StringIO()
@@ -108,8 +96,3 @@ def test_what_is_next_names_the_run_and_how_to_train_what_was_not_visited(coordi
     assert command.endswith("--load-dir run/nerfstudio_models --pipeline.max-seconds 120 --data 'my wall'")
     coordinator.state.step = 1000
     assert "--max-num-iterations 2000" in next_steps(coordinator, "abcd", Path("wall"), Path("run/m"))[-1]
-
-
-def test_without_visits_nothing_is_said_of_them(coordinator, capsys):
-    ProgressReport(coordinator).close()
-    assert len(capsys.readouterr().out.splitlines()) == 1

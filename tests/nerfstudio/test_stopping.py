@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_resume
+from abcd_ns.nerfstudio.run.stopping import StopSignals, command_to_resume
 
 
 @pytest.fixture(autouse=True)
@@ -15,33 +15,6 @@ def python_handles_interrupts():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_acts_at_once_where_nothing_is_held(number):
-    with pytest.raises(Stopped) as stopped, StopSignals():
-        signal.raise_signal(number)
-    assert stopped.value.received == number
-    assert stopped.value.exit_code == 128 + number
-
-
-def test_a_signal_waits_for_the_end_of_a_step():
-    with StopSignals() as signals:
-        signals.check()
-        signals.hold()
-        signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(Stopped):
-            signals.check()
-        with pytest.raises(Stopped):
-            signals.release()
-
-
-def test_a_second_ctrl_c_does_not_wait():
-    with StopSignals() as signals:
-        signals.hold()
-        signal.raise_signal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
 
 
 def test_handlers_are_put_back():

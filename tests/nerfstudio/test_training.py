@@ -22,8 +22,8 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.run.stopping import Stopped
-from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
-from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
+from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
+from tests.reference.colmap_scene import HEIGHT, WIDTH
 
 STEPS = 36
 
@@ -106,15 +106,6 @@ def test_workers_end_with_their_run_and_visits_are_saved_where_it_is_stopped(dat
     assert done[:3] == ["save", "await_visits", "save"] or end is RuntimeError
 
 
-def test_a_checkpoint_takes_away_its_own_leftovers_and_no_others(tmp_path):
-    own, report = tmp_path / ".step-000000009.ckpt.0a1b2c3d.tmp", tmp_path / ".report.html.0a1b2c3d.tmp"
-    own.touch(), report.touch()
-    path = tmp_path / "nerfstudio_models" / "step-000000010.ckpt"
-    _save_atomically({"step": 10}, path)
-    assert torch.load(path, weights_only=True) == {"step": 10}
-    assert sorted(tmp_path.iterdir()) == [report, path.parent]
-
-
 def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     (checkpoint,) = trained.checkpoint_dir.iterdir()
     assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
@@ -128,15 +119,6 @@ def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
     assert len(in_store) == trained.pipeline.coordinator.count() > 150
     assert store.pins == [checkpoint.stem]
-
-
-def test_training_improved_the_held_out_views(trained):
-    _, pipeline, _, step = eval_setup(trained.base_dir / "config.yml")
-    assert step == STEPS - 1
-    metrics = pipeline.get_average_eval_image_metrics()
-    assert len(pipeline.datamanager.fixed_indices_eval_dataloader) == HELD_OUT
-    assert metrics["psnr"] > 14
-    assert 0 < metrics["ssim"] <= 1
 
 
 def test_composited_and_merged_pictures_of_a_checkpoint_agree(trained):
@@ -206,21 +188,15 @@ def test_the_other_methods_train_and_load(data, tmp_path, method):
 
 
 def test_while_training_only_the_live_block_is_registered(data, tmp_path):
-    config = configure(data, tmp_path, steps=3)
-    trainer = run(config)
-    count = trainer.pipeline.coordinator.count()
-    config = configure(data, tmp_path / "b")
+    config = configure(data, tmp_path)
     config.pipeline.training.warmup = 0.0
-    stopped = run(config, stop_after=2)
-    live = [p.shape[0] for n, p in stopped.pipeline.model.named_parameters() if n.endswith("means")]
-    assert 0 < sum(live) < count
+    pipeline = run(config, stop_after=2).pipeline
+    live = [p.shape[0] for n, p in pipeline.model.named_parameters() if n.endswith("means")]
+    assert 0 < sum(live) < pipeline.coordinator.count()
 
 
-@pytest.mark.parametrize(
-    "method", [methods.abcd, methods.abcd_monolithic], ids=lambda m: m.config.method_name
-)
-def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, method, capsys):
-    config = configure(data, tmp_path, method, steps=8)
+def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, capsys):
+    config = configure(data, tmp_path, steps=8)
     config.pipeline.training.density.max_gaussians = 100
     trainer = run(config)
     assert 90 < trainer.pipeline.coordinator.count() <= 100  # some go at the end

@@ -26,7 +26,7 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
 from abcd_ns.run import STORE
-from abcd_ns.run.begin import Capture, RunBuilder
+from abcd_ns.run.begin import Capture, begin_run
 from abcd_ns.run.options import RunOptions
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
@@ -132,8 +132,8 @@ class Lab:
         options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
         folder = Path(tempfile.mkdtemp(dir=self._folder)) / STORE
         live = nothing_live(SH_DEGREE)
-        builder = RunBuilder(options, stage.capture(SH_DEGREE), "cpu", say=lambda _: None)
-        return builder.build(folder, Budget(steps=budget), self.rasterizer, *live)
+        capture, steps, device = stage.capture(SH_DEGREE), Budget(steps=budget), torch.device("cpu")
+        return begin_run(options, capture, device, folder, steps, self.rasterizer, *live, say=lambda _: None)
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.

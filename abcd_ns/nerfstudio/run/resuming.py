@@ -1,6 +1,5 @@
 """What --load-dir, --load-step and --load-checkpoint resume."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from nerfstudio.engine.trainer import TrainerConfig
@@ -9,24 +8,8 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.manifest import manifest_path, pin_names
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.settings import Plain
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.store import ASKED, Start
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """A training, as its trainer begins it."""
-
-    config: TrainerConfig
-    folder: Path
-    """For all that is ours: STATE in the run's folder."""
-    total_steps: int
-    """Of the whole run, those before a resume included."""
-    options: dict[str, Plain]
-    """As it was asked for, by dotted name: `config` has what follows from them, too."""
-    resumed_from: Start | None
-    """What it goes on from; None begins anew."""
 
 
 def find_start(config: TrainerConfig) -> Start | None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import psutil
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.data.input_errors import say
 from abcd_ns.data.photos import Photos
 from abcd_ns.engine.events import (
     EpochEnded,
@@ -29,11 +29,9 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.errors import UserError
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA, Line, SampleLine, VisitEndLine
-from abcd_ns.nerfstudio.run.resuming import RunRequest
-from abcd_ns.nerfstudio.run.settings import write_settings
+from abcd_ns.run.store import Start
 
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
@@ -173,7 +171,7 @@ class RunLog:
                 file.write(text)
         except OSError as error:
             what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."
-            CONSOLE.print(what, style="yellow", markup=False, emoji=False, soft_wrap=True)
+            say(what, "yellow")
             self._path = None
 
 
@@ -195,25 +193,16 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
     return kept
 
 
-def keep_log(run: RunRequest, photos: Photos, coordinator: Trainer) -> RunLog:
-    """Begin the log of a run, and write its settings beside it.
-
-    Raises:
-        UserError: the disk refused.
-    """
-    try:
-        write_settings(run.config, run.options, run.folder)
-    except OSError as error:
-        refused = f"{run.folder} cannot be written to ({error.strerror})"
-        raise UserError(f"{refused}: free space, or choose another --output-dir.") from error
+def keep_log(coordinator: Trainer, photos: Photos, folder: Path, resumed_from: Start | None) -> RunLog:
+    """Begin the log of a run in `folder`, with the past of the run that it resumes."""
     scene = coordinator.scene
     meters = {
         "photos": (lambda: photos.cached_bytes, photos.budget_bytes),
         "frozen blocks": (lambda: scene.cached_bytes, scene.ram_bytes),
         "layers": (lambda: coordinator.layer_bytes, coordinator.layer_limit),
     }
-    earlier = None if run.resumed_from is None else run.resumed_from.store.parent / LOG_FILE
-    return RunLog(coordinator, run.folder / LOG_FILE, meters, earlier)
+    earlier = None if resumed_from is None else resumed_from.store.parent / LOG_FILE
+    return RunLog(coordinator, folder / LOG_FILE, meters, earlier)
 
 
 def _finite(value: float | None) -> float | None:

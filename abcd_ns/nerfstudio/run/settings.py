@@ -17,6 +17,7 @@ import msgspec
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store.atomic import write_file
+from abcd_ns.errors import UserError
 from abcd_ns.machine import Machine, Versions, describe_machine, describe_versions
 from abcd_ns.nerfstudio.datamanager import OUR_READER, reader_name
 
@@ -54,6 +55,9 @@ def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Pat
 
     Args:
         options: as they were asked for.
+
+    Raises:
+        UserError: the disk refused.
     """
     data = Path(config.pipeline.datamanager.data)
     path = data.resolve()
@@ -71,7 +75,11 @@ def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Pat
     )
     plain = msgspec.to_builtins(settings, enc_hook=str)  # torch's version is a string of its own
     content = json.dumps(plain, indent=2, allow_nan=False)
-    write_file(folder / SETTINGS_FILE, (content + "\n").encode())
+    try:
+        write_file(folder / SETTINGS_FILE, (content + "\n").encode())
+    except OSError as error:
+        refused = f"{folder} cannot be written to ({error.strerror})"
+        raise UserError(f"{refused}: free space, or choose another --output-dir.") from error
 
 
 def flat_options(config: Any) -> dict[str, Plain]:

@@ -23,11 +23,6 @@ class Stopped(BaseException):
         super().__init__(received)
         self.received = received
 
-    @property
-    def exit_code(self) -> int:
-        """What a shell expects of a process that was ended by a signal."""
-        return 128 + self.received
-
 
 @contextmanager
 def at_once(say: Callable[[], None]) -> Iterator[None]:
