@@ -44,20 +44,12 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
 
 
 def check_scene(job: Job) -> None:
-    """Look at the scene as a worker would, photos included.
-
-    Raises:
-        UserError: it cannot be trained on.
-    """
+    """Raise a UserError if the scene cannot be trained on, photos included."""
     inspect(_parser(job))
 
 
 def check_options(job: Job) -> None:
-    """Check that the options that the job changes go together.
-
-    Raises:
-        UserError: they do not.
-    """
+    """Raise a UserError if the options that the job changes do not go together."""
     if not job.changes:
         return
     pipeline = _abcd(job).pipeline

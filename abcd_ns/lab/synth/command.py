@@ -58,11 +58,7 @@ class Settings:
     """Rays per pixel along each axis."""
 
     def check(self) -> None:
-        """Whether all of them can be drawn.
-
-        Raises:
-            UserError: one is out of range.
-        """
+        """Raise a UserError if one is out of range."""
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if not low <= value <= high:

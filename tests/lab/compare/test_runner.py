@@ -16,7 +16,7 @@ from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.job import Job, Plan
 from abcd_ns.lab.results.records import encode
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs.runner import last_line, run_jobs
+from abcd_ns.lab.runs.runner import run_jobs
 from tests.lab.compare.records import MACHINE, read_results
 
 
@@ -160,12 +160,3 @@ def test_splatfacto_is_left_out_with_a_reason_where_gaussians_are_limited(plan, 
         ("splatfacto", True),
         ("splatfacto-scaled", True),
     ]
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [(b"", ""), (b"\n \n", ""), (b"a\nb\n\n", "b"), (b"10%\r20%\r", "20%"), (b"\xff\n", "\ufffd")],
-)
-def test_last_line_of_a_log(tmp_path, content, expected):
-    (tmp_path / "log").write_bytes(content)
-    assert last_line(tmp_path / "log") == expected
