@@ -77,8 +77,6 @@ class TerrainSettings:
     """In each tile."""
     visits: int
     """Budget of a run; in one block none."""
-    ram_budget_bytes: int = 16 << 20
-    """For blocks that were read, smaller than any scene; layers and photos have their own."""
     device_limit_bytes: int = 0
     """GPU memory that may be taken, as if the card had no more; 0 for all of it."""
 

@@ -88,6 +88,7 @@ class ExactTrainer(Trainer):
         self._residuals: list[Float[Tensor, "_h _w 3"]] = []
         self._pictures: list[Tensor] = []
         self._take()
+        self.scene.set_live(None, lambda: self._all.gaussians)
 
     @property
     def batch(self) -> int:
@@ -150,7 +151,6 @@ class ExactTrainer(Trainer):
         joined, order = join(updated), torch.cat(rows)
         kept = all(len(state) == len(row) for state, row in zip(updated, rows, strict=True))
         self._all = joined[order.argsort()] if kept else joined
-        self._lay_over()
         self._pictures, self._layers_of = [], []
         _, psnr = self.health.end_step(errors)
         self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
@@ -193,11 +193,6 @@ class ExactTrainer(Trainer):
     def _take(self) -> None:
         blocks = range(self.scene.tree.num_blocks)
         self._all = join([self.scene.state(block) for block in blocks])
-        self._lay_over()
-
-    def _lay_over(self) -> None:
-        everything = self._all.gaussians
-        self.scene.set_live(None, lambda: everything)
 
     def _owner_of_all(self) -> Int64[Tensor, "n"]:
         return self.scene.tree.assign(self._all.gaussians.means)

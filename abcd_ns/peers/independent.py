@@ -92,7 +92,7 @@ class Surfaces:
         scales = gaussians.scales + math.log(SURFACE_SCALE)
         opacities = torch.full_like(gaussians.opacities, opaque)
         points = replace(gaussians, opacities=opacities, scales=scales).to(device)
-        self._depths = {index: self._depth(points, view, rasterizer) for index, view in self._views.items()}
+        self._depths = {index: depth_of(points, view, rasterizer) for index, view in self._views.items()}
 
     def region(self, view: int, cell: Box) -> UInt8[Tensor, "h w"]:
         """What every pixel of `view` is to a block with this cell: OWN, CLEAR or 0."""
@@ -104,13 +104,13 @@ class Surfaces:
         hidden = (depth < near) & near.isfinite()
         return (OWN * own + CLEAR * (~own & ~hidden)).to(torch.uint8)
 
-    @staticmethod
-    @torch.no_grad()
-    def _depth(points: Gaussians, view: View, rasterizer: Rasterizer) -> Float[Tensor, "h w"]:
-        raster = rasterizer(points, view, sh_degree=0)
-        alpha = 1 - raster.transmittance
-        shown = raster.depth / alpha.clamp_min(1e-10)
-        return torch.where(alpha > 0.5, shown, BEYOND).float().cpu()
+
+@torch.no_grad()
+def depth_of(points: Gaussians, view: View, rasterizer: Rasterizer) -> Float[Tensor, "h w"]:
+    """How far the surface is at every pixel; BEYOND where points cover less than half of it."""
+    raster = rasterizer(points, view, sh_degree=0)
+    alpha = 1 - raster.transmittance
+    return torch.where(alpha > 0.5, raster.depth / alpha.clamp_min(1e-10), BEYOND).float().cpu()
 
 
 class BlocksAlone(Visits):

@@ -12,7 +12,8 @@ from abcd_ns.lab.runs.splatfacto import Splatfacto, scaled
 BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
 
 
-def test_it_is_made_without_fetching_weights(monkeypatch):
+@pytest.mark.skipif(torch.cuda.is_available(), reason="it then draws by gsplat itself")
+def test_it_trains_grows_and_draws_on_a_cpu_and_fetches_no_weights(monkeypatch):
     from nerfstudio.configs.method_configs import method_configs
 
     def fetch(*_args, **_options):
@@ -20,18 +21,6 @@ def test_it_is_made_without_fetching_weights(monkeypatch):
 
     monkeypatch.setattr("torch.hub.download_url_to_file", fetch)
     monkeypatch.setattr("torch.hub.load_state_dict_from_url", fetch)
-    model = Splatfacto(
-        replace(method_configs["splatfacto"].pipeline.model, random_init=True, num_random=50),
-        scene_box=BOX,
-        num_train_data=3,
-    )
-    assert model.num_points == 50
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="it then draws by gsplat itself")
-def test_it_trains_grows_and_draws_on_a_cpu():
-    from nerfstudio.configs.method_configs import method_configs
-
     torch.manual_seed(0)
     config = scaled(method_configs["splatfacto"], 1500).pipeline.model
     config = replace(config, num_downscales=0, cull_alpha_thresh=0.005, background_color="black")

@@ -11,12 +11,10 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import Options, compare, make_plan, terrain_jobs
 from abcd_ns.lab.job import TerrainJob, TerrainSettings
-from abcd_ns.lab.results.records import decode, encode, read_json
-from abcd_ns.lab.results.results import TERRAIN, Arm, Results
+from abcd_ns.lab.results.results import TERRAIN, Arm
 from abcd_ns.lab.results.run import Failure, Footing, Run
-from abcd_ns.lab.results.tables import notes, write_table
+from abcd_ns.lab.results.tables import write_table
 from abcd_ns.lab.runs.runner import why_left_out
-from abcd_ns.lab.runs.terrain import run
 from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
@@ -40,17 +38,6 @@ def test_each_block_of_the_land_is_one_tile(tiles):
         )
 
 
-def options(out, **given) -> Options:
-    return Options(out=str(out), **given)
-
-
-def test_the_command_that_is_kept_can_be_given_again(tmp_path):
-    plan = make_plan(options(tmp_path / "my land; x", tiles=(4, 2), tile_gaussians=300, visits=1))
-    words = ["abcd", "compare", "--out", "my land; x", "--methods", "abcd", "--seeds", "0"]
-    words += ["--tiles", "4", "2", "--tile-gaussians", "300", "--visits", "1"]
-    assert shlex.split(plan.command) == words
-
-
 def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
     land = Land(4, 10)
     for view in land.cameras()[::5]:
@@ -67,20 +54,6 @@ def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
         assert torch.equal(land.crop(view, crop), photo[crop.slices])
 
 
-@pytest.mark.parametrize("method", ["abcd", AS_ONE])
-def test_a_measurement_trains_and_says_what_it_took(tmp_path, method):
-    (job,) = terrain_jobs(TerrainSettings(300, 1, MIB), [2], [method], [0])
-    assert decode(TerrainJob, encode(job), "here") == job
-    found = run(job, tmp_path)
-    assert (found.gaussians, found.blocks) == (600, 1 if method == AS_ONE else 2)
-    assert found.peak_rss_bytes >= found.memory.base_rss_bytes > 0
-    assert found.store_bytes >= 600 * 3 * 14 * 4  # with moments; harmonics as far as there are any
-    assert found.steps > 0
-    assert found.psnr > 10
-    assert (found.memory.visit_seconds is None) == (method == AS_ONE)
-    assert decode(Run, encode(found), "here") == found
-
-
 def made_up_land(tiles: int, peak: int, method: str = "abcd", device: int | None = None) -> Arm:
     visit = None if method == AS_ONE else 2.0
     footing = Footing(400 * MIB, 1.0, 1.0, visit, visit)
@@ -88,32 +61,6 @@ def made_up_land(tiles: int, peak: int, method: str = "abcd", device: int | None
     found = made_up_run(method, **fields)
     found = replace(found, memory=footing, psnr_merged=None, curve=())
     return Arm(method, f"tiles={tiles}", tiles, (found,))
-
-
-def results_of(*arms: Arm) -> Results:
-    return made_up(TERRAIN, *arms, settings=None)
-
-
-def test_growth_is_from_the_smallest_to_the_largest():
-    arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, AS_ONE)]
-    results = results_of(*arms)
-    assert results.findings == ("From 2 to 8 blocks of ABCD, peak RAM grows by 4.0%; allowed: 5%.",)
-    on_gpu = results_of(made_up_land(2, 500, device=100), made_up_land(4, 500, device=150))
-    assert "GPU memory by 50.0%" in on_gpu.findings[0]
-    assert results_of(arms[0]).findings == ()
-
-
-def test_results_are_written_in_words_and_drawn(tmp_path, drawn):
-    sizes = ((2, 500, "abcd"), (8, 520, "abcd"), (2, 450, AS_ONE), (8, 900, AS_ONE))
-    results = results_of(*(made_up_land(*size) for size in sizes))
-    write_table(results, tmp_path / "table.md")
-    text = (tmp_path / "table.md").read_text()
-    assert "grows by 4.0%" in text
-    assert "| visit (s) | 2.0 | 2.0 | - | - |" in text
-    assert "PSNR" not in text
-    assert any("400 MiB" in note for note in notes(results))
-    assert [path.name for path in draw_charts(results, tmp_path)] == ["memory.png"]
-    assert {"abcd, RAM", "abcd-monolithic, RAM", "RAM before any scene"} <= set(drawn["memory.png"])
 
 
 @pytest.mark.parametrize(
@@ -133,7 +80,7 @@ def test_results_are_written_in_words_and_drawn(tmp_path, drawn):
 )
 def test_what_cannot_be_measured_is_refused(tmp_path, given, expected):
     with pytest.raises(UserError, match=expected):
-        make_plan(options(tmp_path / "out", **{"tiles": (2, 4), **given}))
+        make_plan(Options(out=str(tmp_path / "out"), **{"tiles": (2, 4), **given}))
 
 
 def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, monkeypatch):
@@ -152,20 +99,50 @@ def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, mon
 
     monkeypatch.setattr("abcd_ns.lab.runs.runner.finish_job", made_up_end)
     both = {"methods": ("abcd", AS_ONE), "tile_gaussians": 10}
-    assert compare(options(tmp_path, tiles=(2, 4, 8), **both)) == 0
+    assert compare(Options(out=str(tmp_path), tiles=(2, 4, 8), **both)) == 0
     assert tried == [(2, "abcd"), (2, AS_ONE), (4, "abcd"), (4, AS_ONE), (8, "abcd")]
     found = read_results(tmp_path / "results.json")
     assert (found.failures, len(found.arms)) == ((), 4)
     assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
 
 
-def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):
+def test_growth_of_memory_is_said_and_drawn(tmp_path, drawn):
+    arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520)]
+    joint = [made_up_land(2, 450, AS_ONE), made_up_land(8, 900, AS_ONE)]
+    results = made_up(TERRAIN, *arms, *joint, settings=None)
+    assert results.findings == ("From 2 to 8 blocks of ABCD, peak RAM grows by 4.0%; allowed: 5%.",)
+    write_table(results, tmp_path / "table.md")
+    text = (tmp_path / "table.md").read_text()
+    assert "| visit (s) | 2.0 | 2.0 | 2.0 | - | - |" in text
+    assert "PSNR" not in text
+    assert "400 MiB" in text
+    assert [path.name for path in draw_charts(results, tmp_path)] == ["memory.png"]
+    assert {"abcd, RAM", "abcd-monolithic, RAM", "RAM before any scene"} <= set(drawn["memory.png"])
+    on_gpu = made_up_land(2, 500, device=100), made_up_land(4, 500, device=150)
+    assert "GPU memory by 50.0%" in made_up(TERRAIN, *on_gpu, settings=None).findings[0]
+    assert made_up(TERRAIN, arms[0], settings=None).findings == ()
+
+
+def test_the_command_trains_writes_and_reuses(tmp_path, capsys, monkeypatch):
     jobs_in_this_process(monkeypatch)
-    given = options(tmp_path / "out", tiles=(2, 4), tile_gaussians=200, visits=1)
-    assert compare(given) == 0
-    first = read_json(tmp_path / "out" / "results.json")
-    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4)]
-    assert compare(given) == 0
-    assert read_json(tmp_path / "out" / "results.json")["arms"] == first["arms"]
-    assert not list(tmp_path.glob("out/runs/*/*/store"))
+    out = tmp_path / "my land; x"
+    given = {"tiles": (2, 1), "methods": ("abcd", AS_ONE), "tile_gaussians": 200, "visits": 1}
+    assert compare(Options(out=str(out), **given)) == 0
+    first = read_results(out / "results.json")
+    words = ["abcd", "compare", "--out", "my land; x", "--methods", AS_ONE, "abcd", "--seeds", "0"]
+    words += ["--tiles", "2", "1", "--tile-gaussians", "200", "--visits", "1"]
+    assert shlex.split(first.command) == words
+    sizes = [("abcd", 1), (AS_ONE, 1), ("abcd", 2), (AS_ONE, 2)]
+    assert [(arm.method, arm.value) for arm in first.arms] == sizes
+    for arm in first.arms:
+        (run,) = arm.runs
+        assert (run.gaussians, run.blocks) == (200 * arm.value, arm.value if arm.method == "abcd" else 1)
+        assert run.peak_rss_bytes >= run.memory.base_rss_bytes > 0
+        assert run.store_bytes >= run.gaussians * 3 * 14 * 4  # with moments
+        assert run.steps > 0
+        assert run.psnr > 10
+        assert run.memory.visit_seconds is None or arm.method == "abcd"
+    assert compare(Options(out=str(out), **given)) == 0
+    assert read_results(out / "results.json").arms == first.arms
+    assert not list(out.glob("runs/*/*/store"))
     assert "peak RAM grows by" in capsys.readouterr().out.replace("\n", " ")

@@ -5,7 +5,7 @@ import torch
 
 from abcd_ns.lab.world.solids import Thing, ball, block, tube
 from abcd_ns.lab.world.textures import Material
-from abcd_ns.lab.world.world import FAR, TABLE, Ball, Surfaces, camera, project, rays_through, ring
+from abcd_ns.lab.world.world import FAR, Ball, Surfaces, camera
 
 
 def test_rays_end_on_the_surface_that_is_nearest():
@@ -18,17 +18,6 @@ def test_rays_end_on_the_surface_that_is_nearest():
     assert bool((on_ball | ((radii - 4.0).abs() < 1e-9)).all())
     assert bool((places[on_ball][:, 1] < 0).all())
     assert 0.05 < float(on_ball.double().mean()) < 0.5
-
-
-def test_points_have_the_colours_of_the_photos():
-    views = ring(3)
-    points, colors = TABLE.points(views, 90)
-    assert points.shape == colors.shape == (90, 3)
-    photo = TABLE.photo(views[0], fine=1)
-    local = points[:30].float() @ views[0].viewmat[:3, :3].T + views[0].viewmat[:3, 3]
-    pixels = (local @ views[0].K.T)[:, :2] / local[:, 2:]
-    rows, columns = pixels[:, 1].long(), pixels[:, 0].long()
-    assert torch.allclose(photo[rows, columns], colors[:30] / 255, atol=1e-4)
 
 
 STONE = Material("clouds", *[(0.5, 0.5, 0.5)] * 3)
@@ -84,24 +73,3 @@ def test_a_thing_gives_the_first_of_its_solids():
     thing.meet(origins, directions, t, which)
     assert which.tolist() == [0, 2, 1, -1]
     assert t.tolist() == pytest.approx([8.0, 11.2, 8.3, FAR])
-
-
-@pytest.mark.parametrize("kind", ["blocks", "clouds"])
-def test_textures_fade_where_they_cannot_be_resolved(kind):
-    """Seen with a large footprint, every texture is smoother than close up, and about as bright."""
-    material = Material(kind, (0.5, 0.4, 0.3), (0.2, 0.2, 0.2), (0.6, 0.5, 0.4), (0.3, 0.2), 5.0)
-    position = 6 * torch.rand((3, 4000), generator=torch.Generator().manual_seed(1))
-    fine, coarse = (material.albedo(position[:2], position, torch.full((4000,), f)) for f in (0.001, 1.0))
-    assert float(fine.min()) >= 0.01
-    assert float(fine.max()) <= 0.95
-    assert float(coarse.std()) <= float(fine.std()) + 1e-6
-    assert float(coarse.mean()) == pytest.approx(float(fine.mean()), rel=0.35)
-
-
-def test_projection_is_the_inverse_of_the_rays():
-    view = camera((1.0, -2.0, 1.5), (0.0, 3.0, 1.0), 0).to(torch.float64)
-    xy = 36 * torch.rand((20, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    depth = torch.linspace(0.5, 40, 20, dtype=torch.float64)
-    back, z = project(view, view.center + depth[:, None] * rays_through(view, xy))
-    assert torch.allclose(back, xy, atol=1e-4)
-    assert torch.allclose(z, depth, rtol=1e-6)

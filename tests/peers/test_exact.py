@@ -115,17 +115,6 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(exact, photos):
         assert float((getattr(found, name) - value).abs().mean()) < 1e-3 * moved, name
 
 
-def test_blocks_do_not_matter_with_densification_either(exact, photos):
-    counts = []
-    for blocks in (1, 4):
-        coordinator = exact(str(blocks), blocks=blocks, steps=14, density=GROWING)
-        train(coordinator, photos)
-        counts.append(coordinator.count())
-        assert coordinator.finished
-    assert counts[0] > 150
-    assert abs(counts[1] - counts[0]) <= 0.05 * counts[0]
-
-
 def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(exact, photos):
     coordinator = exact(blocks=4, steps=4)
     while not coordinator.finished:

@@ -12,12 +12,9 @@ from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independen
 from tests.reference.scenes import (
     GROWING,
     STILL,
-    Photos,
     assert_resumes,
     equal,
     listen,
-    random_gaussians,
-    whole_scene,
 )
 
 
@@ -131,23 +128,6 @@ def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_on
         for (name, difference), mask in zip(apart.items(), masks, strict=True):
             assert torch.allclose(picture.grad[mask], scale * difference[mask], atol=1e-9), name
     assert bool((kinds > 0).all())
-
-
-def test_training_improves_every_photo_of_a_scene_with_surfaces(independent, views):
-    truth = random_gaussians(300, seed=7, size=0.15)
-    truth.opacities[:] = 4.0
-    photos = Photos(truth, views)
-    grey = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
-    # Small steps: by themselves, blocks of so small a scene overshoot where photos say little.
-    coordinator = independent(start=grey, steps=300, density=STILL, batch=1)
-
-    def errors() -> torch.Tensor:
-        drawn = Photos(whole_scene(coordinator), views).images
-        return torch.stack([(drawn[k] - photos.images[k]).square().mean() for k in drawn])
-
-    before = errors()
-    train(coordinator, photos)
-    assert bool((errors() < 0.9 * before).all()), (before, errors())
 
 
 def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(independent, photos):

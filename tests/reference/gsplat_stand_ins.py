@@ -11,8 +11,6 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -24,8 +22,6 @@ from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs,
 from tests.reference.simulated_device import kernel
 from tests.reference.triton_stand_ins import lent_triton
 
-PAIRS_AT_ONCE = 4096
-"""(Gaussian, tile) pairs that are composited together, unless a tile has more: bounds memory."""
 LOG_STOP = math.log(1e-4)
 """Of the transmittance at which drawing stops."""
 NAMES = (
@@ -165,10 +161,23 @@ def rasterize_to_pixels(
     assert isect_offsets.shape[1] * tile_size >= image_height
     assert isect_offsets.shape[2] * tile_size >= image_width
     assert masks is None or masks.shape == isect_offsets.shape
-    size = image_width, image_height, tile_size
+
+    def _rasterize(*tensors: Tensor) -> tuple[Tensor, Tensor]:
+        *splats, offsets, flatten_ids = tensors[:6]
+        shown = tensors[6] if len(tensors) > 6 else torch.ones_like(offsets, dtype=torch.bool)
+        lists = _drawn_lists(offsets, flatten_ids, shown, (image_width, image_height, tile_size))
+        tiles = _tiles(splats, *lists, tile_size)
+        blank = tiles.new_zeros(tiles.shape[2])
+        blank[-1] = torch.nan
+        tiles = torch.where(shown.flatten()[:, None, None], tiles, blank)
+        cameras, rows, cols = offsets.shape
+        image = tiles.view(cameras, rows, cols, tile_size, tile_size, -1).transpose(2, 3)
+        image = image.flatten(3, 4).flatten(1, 2)[:, :image_height, :image_width].to(splats[2])
+        return image[..., :-1].contiguous(), image[..., -1:].contiguous()
+
     splats = (tensor.contiguous() for tensor in (means2d, conics, colors, opacities))
-    tensors = *splats, isect_offsets, flatten_ids
-    return _Rasterize.apply(size, *tensors, *(() if masks is None else (masks,)))
+    tensors = *splats, isect_offsets, flatten_ids, *(() if masks is None else (masks,))
+    return Differentiable.apply(_rasterize, *tensors)
 
 
 @stands_in(backgrounds=None, packed=True, absgrad=False, distloss=False)
@@ -199,118 +208,31 @@ def _drawn_lists(
     return (counts.cumsum(0) - counts).view_as(offsets), kept
 
 
-class _Rasterize(torch.autograd.Function):
-    """Composites tiles, some of them at a time, and does so again for the gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, size: tuple[int, int, int], *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.size = size
-        ctx.save_for_backward(*tensors)
-
-        def _rasterize(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-            *inputs, offsets, flatten_ids, masks = _with_masks(tensors)
-            lists = _drawn_lists(offsets, flatten_ids, masks, size)
-            parts = torch.cat([_tiles(p, b, (*inputs, *lists), size[2])[0] for p, b in _parts(*lists)])
-            parts[~masks.flatten(), :, -1] = torch.nan
-            image = _image(parts, offsets, size).to(tensors[2])
-            return image[..., :-1].contiguous(), image[..., -1:].contiguous()
-
-        return tuple(kernel(_rasterize, *tensors))
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Any:
-        upstream = [gradient.contiguous() for gradient in upstream]
-        gradients = kernel(partial(_gradients, ctx.size), *upstream, *ctx.saved_tensors)
-        return None, *gradients, *[None] * (len(ctx.saved_tensors) - len(gradients))
-
-
-def _with_masks(tensors: Sequence[Tensor]) -> Sequence[Tensor]:
-    """What is rasterized, with masks: of all tiles where none are given."""
-    return tensors if len(tensors) == 7 else (*tensors, torch.ones_like(tensors[4], dtype=torch.bool))
-
-
-def _parts(offsets: Tensor, flatten_ids: Tensor) -> Iterator[tuple[range, list[int]]]:
-    """Tiles that are composited together, and where the pairs of each begin; their end last."""
-    starts = [*offsets.flatten().tolist(), len(flatten_ids)]
-    first = 0
-    for tile in range(len(starts) - 1):
-        if tile + 2 == len(starts) or starts[tile + 2] - starts[first] > PAIRS_AT_ONCE:
-            yield range(first, tile + 1), starts[first : tile + 2]
-            first = tile + 1
-
-
-def _tiles(
-    tiles: range, starts: list[int], tensors: Sequence[Tensor], side: int, wants_gradient: bool = False
-) -> tuple[Tensor, list[Tensor], Tensor]:
-    """Composite some tiles: [tiles, side * side, channels + 1], alpha last.
-
-    Returns:
-        The picture, the values of each pair that it is made of ([pairs, pixels, 2] for the distances from the
-        mean), and the row of each pair's Gaussian.
-    """
-    means2d, conics, colors, opacities, offsets, flatten_ids = tensors
-    rows = flatten_ids[starts[0] : starts[-1]].long()
-    counts = torch.tensor(starts).diff()
-    tile = torch.repeat_interleave(counts)
-    first = torch.tensor(starts)[:-1] - starts[0]
-    number = torch.arange(tiles.start, tiles.stop)[tile] % (offsets.shape[1] * offsets.shape[2])
+def _tiles(splats: Sequence[Tensor], offsets: Tensor, flatten_ids: Tensor, side: int) -> Tensor:
+    """Composite tiles: [tiles, side * side, channels + 1], alpha last."""
+    first, rows = offsets.flatten().long(), flatten_ids.long()
+    tile = torch.repeat_interleave(torch.cat((first, first.new_tensor([len(rows)]))).diff())
+    number = tile % (offsets.shape[1] * offsets.shape[2])
     origin = torch.stack((number % offsets.shape[2], number // offsets.shape[2]), dim=1) * side
     pixel = torch.arange(side * side)
     centers = torch.stack((pixel % side, pixel // side), dim=1) + 0.5
     # float64: transmittances are differences of logarithms, summed over all tiles.
-    values = [x.detach()[rows].double() for x in (means2d, conics, colors, opacities)]
-    values[0] = (values[0] - origin)[:, None] - centers
-    values = [x.requires_grad_(wants_gradient) for x in values]
-    if values[1].ndim == 3:
-        sigma = surfel_sigma(values[0], values[1], origin[:, None] + centers)
+    means2d, conics, colors, opacities = (values[rows].double() for values in splats)
+    offset = (means2d - origin)[:, None] - centers
+    if conics.ndim == 3:
+        sigma = surfel_sigma(offset, conics, origin[:, None] + centers)
     else:
-        (dx, dy), (a, b, c) = values[0].unbind(2), values[1][:, None].unbind(2)
+        (dx, dy), (a, b, c) = offset.unbind(2), conics[:, None].unbind(2)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = (values[3][:, None] * torch.exp(-sigma)).clamp_max(0.999)
+    alpha = (opacities[:, None] * torch.exp(-sigma)).clamp_max(0.999)
     alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
     through = torch.log1p(-alpha)
     behind = torch.cat((through.new_zeros(1, side * side), through.cumsum(0)))
     before = behind[:-1] - behind[first][tile]
-    after = before + through
-    weight = torch.where(after > LOG_STOP, alpha * before.exp(), 0.0)
-    drawn = torch.cat((values[2], torch.ones_like(values[3])[:, None]), dim=1)
-    image = drawn.new_zeros(len(tiles), side * side, drawn.shape[1])
-    return image.index_add(0, tile, weight[..., None] * drawn[:, None]), values, rows
-
-
-def _image(tiles: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """[C, h, w, channels] from [tiles, side * side, channels]."""
-    (width, height, side), (cameras, rows, cols) = size, offsets.shape
-    image = tiles.view(cameras, rows, cols, side, side, -1).transpose(2, 3).flatten(3, 4).flatten(1, 2)
-    return image[:, :height, :width].contiguous()
-
-
-def _by_tiles(image: Tensor, offsets: Tensor, side: int) -> Tensor:
-    """The inverse of _image; 0 beyond the image."""
-    cameras, rows, cols = offsets.shape
-    whole = image.new_zeros(cameras, rows * side, cols * side, image.shape[-1])
-    whole[:, : image.shape[1], : image.shape[2]] = image
-    return (
-        whole.view(cameras, rows, side, cols, side, -1)
-        .transpose(2, 3)
-        .reshape(-1, side * side, image.shape[-1])
-    )
-
-
-def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
-    """Of means2d, conics, colours and opacities."""
-    by_color, by_alpha, *tensors = tensors
-    *inputs, offsets, flatten_ids, masks = _with_masks(tensors)
-    lists = _drawn_lists(offsets, flatten_ids, masks, size)
-    upstream = _by_tiles(torch.cat((by_color, by_alpha), dim=-1), offsets, size[2]).double()
-    sums = [torch.zeros_like(x, dtype=torch.float64) for x in inputs]
-    for tiles, starts in _parts(*lists):
-        with torch.enable_grad():
-            picture, values, rows = _tiles(tiles, starts, (*inputs, *lists), size[2], wants_gradient=True)
-            found = torch.autograd.grad(picture, values, upstream[tiles.start : tiles.stop])
-        for total, part in zip(sums, (found[0].sum(1), *found[1:]), strict=True):
-            total.index_add_(0, rows, part)
-    return [total.to(x) for total, x in zip(sums, inputs, strict=True)]
+    weight = torch.where(before + through > LOG_STOP, alpha * before.exp(), 0.0)
+    drawn = torch.cat((colors, torch.ones_like(opacities)[:, None]), dim=1)
+    image = drawn.new_zeros(len(first), side * side, drawn.shape[1])
+    return image.index_add(0, tile, weight[..., None] * drawn[:, None])
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from tests.reference.scenes import STILL, Photos, listen, stop, whole_scene
+from tests.reference.scenes import STILL, listen, stop, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
@@ -37,21 +37,39 @@ def assert_on_device(coordinator) -> None:
         assert {parameter.device, *(state[key].device for key in ("step", *MOMENTS))} == {DEVICE}
 
 
+APART = {"kind": independent_trainer, "content": independent_at_rest, "layers": False, "migrate": False}
+
+
 @pytest.mark.parametrize(
-    ("blocks", "density", "layers"),
-    [(1, GROWING, True), (4, MCMC, False)],
-    ids=["one", "four-mcmc-ablated"],
+    ("blocks", "steps", "options"),
+    [
+        (1, 8, {}),
+        (4, 16, {"density": MCMC, "layers": False}),
+        (3, 8, {"kind": ExactTrainer}),
+        (2, 6, {**APART, "overlap": 0.25}),
+    ],
+    ids=["one", "four-mcmc-ablated", "jointly", "apart"],
 )
-def test_blocks_are_trained(on_device, start, photos, blocks, density, layers):
-    steps = 8 if blocks == 1 else 16  # so that something grows
-    coordinator = on_device(blocks=blocks, steps=steps, density=density, layers=layers)
+def test_blocks_are_trained(on_device, start, photos, blocks, steps, options):
+    coordinator = on_device(blocks=blocks, steps=steps, **{"density": GROWING, **options})
     train(coordinator, photos, steps=3)
-    assert_on_device(coordinator)
+    if "kind" not in options:
+        assert_on_device(coordinator)
     train(coordinator, photos)
     scene = whole_scene(coordinator)
     assert coordinator.state.step == steps
     assert len(scene) != len(start)
     assert all(bool(value.isfinite().all()) for _, value in scene.items())
+
+
+def test_a_picture_is_composited(on_device, views):
+    coordinator = on_device(blocks=4, steps=2, ownership="fragments")
+    draws, scene = coordinator.run.rasterizer, coordinator.scene
+    renderer = LayerRenderer(scene, views, draws, ownership="fragments", pass_gaussians=0, device=DEVICE)
+    layer = renderer.picture(views[0], RenderSettings(1, False))
+    assert layer.color.device == DEVICE
+    merged = TorchRasterizer(use_native=False)(whole_scene(coordinator), views[0], sh_degree=1)
+    assert float((layer.color.cpu() - merged.color).abs().max()) < 5e-4
 
 
 def test_what_is_hardly_missed_goes_at_the_end(on_device, photos, target, monkeypatch):
@@ -151,33 +169,3 @@ def test_a_run_is_saved_and_gone_on_with(make, on_device, photos):
     assert third.state.step == 5
     train(third, photos)
     assert third.state.step == 11
-
-
-def test_blocks_are_trained_jointly(on_device, start, views, photos):
-    coordinator = on_device(blocks=3, steps=4, density=GROWING, kind=ExactTrainer)
-    train(coordinator, photos)
-    scene = whole_scene(coordinator)
-    before, after = (Photos(each, views).images for each in (start, scene))
-    pairs = ((before[k], after[k], photos.images[k]) for k in before)
-    assert sum(float((a - p).square().mean() - (b - p).square().mean()) for b, a, p in pairs) < 0
-
-
-def test_blocks_are_trained_apart(on_device, photos):
-    options = {"kind": independent_trainer, "content": independent_at_rest, "layers": False, "overlap": 0.25}
-    coordinator = on_device(blocks=2, steps=6, density=GROWING, migrate=False, **options)
-    train(coordinator, photos)
-    assert coordinator.state.step == 6
-
-
-@pytest.mark.parametrize("ownership", ["means", "fragments"])
-def test_a_picture_is_composited(on_device, views, photos, ownership):
-    coordinator = on_device(blocks=4, steps=2, ownership=ownership)
-    draws, scene = coordinator.run.rasterizer, coordinator.scene
-    renderer = LayerRenderer(scene, views, draws, ownership=ownership, pass_gaussians=0, device=DEVICE)
-    layer = renderer.picture(views[0], RenderSettings(1, False))
-    assert layer.color.device == DEVICE
-    if ownership == "fragments":
-        merged = TorchRasterizer(use_native=False)(whole_scene(coordinator), views[0], sh_degree=1)
-        assert float((layer.color.cpu() - merged.color).abs().max()) < 5e-4
-    train(coordinator, photos)
-    assert coordinator.state.step == 2

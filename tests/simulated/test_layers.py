@@ -1,6 +1,5 @@
 """Where layers lie on a device: there, in RAM, or nowhere; and what is copied for it."""
 
-import pytest
 import torch
 
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
@@ -17,41 +16,29 @@ def kept() -> Kept:
     return Kept(torch.rand(2, 6, 8, 4, device=DEVICE).half(), None)
 
 
-@pytest.fixture
-def full(counts):
-    """Room for two on the device and one in RAM; four were put."""
+def test_what_has_no_room_on_the_device_goes_to_ram_and_is_copied_once_when_read(counts):
+    """Room for two on the device and one in RAM; four are put."""
     store = LayerStore(DEVICE, 2 * SIZE, ram_bytes=SIZE)
     layers = [kept() for _ in range(4)]
     before = counts.copy()
     for view, one in enumerate(layers):
         store.put(view, one)
-    return store, layers, counts, counts.since(before)
-
-
-def test_one_has_no_room_and_one_goes_to_ram(full):
-    store, layers, _, put = full
+    put, before = counts.since(before), counts.copy()
     assert (put.copies_to_host, put.bytes_to_host, put.copies_to_device) == (1, SIZE, 0)
     assert store.nbytes == 3 * SIZE
-    assert store.get(3) is None
-    for view in range(3):
-        assert store.get(view).layers.device == DEVICE
-        assert torch.equal(store.get(view).layers.cpu(), layers[view].layers.cpu())
-
-
-def test_reading_copies_what_is_in_ram_and_waits_for_nothing(full):
-    store, _, counts, _ = full
-    before = counts.copy()
-    for view in range(4):
-        store.get(view)
+    found = [store.get(view) for view in range(4)]
     read = counts.since(before)
     assert (read.copies_to_device, read.bytes_to_device, read.waited, read.launches) == (1, SIZE, 0, 0)
+    assert found[3] is None
+    for one, given in zip(found[:3], layers, strict=False):
+        assert one.layers.device == DEVICE
+        assert torch.equal(one.layers.cpu(), given.layers.cpu())
 
 
 def test_what_is_inside_the_window_goes_along(counts):
     store, interleaved = LayerStore(DEVICE, 0, ram_bytes=1 << 20), Splats(torch.rand(11, 5, device=DEVICE))
     store.put(0, Kept(kept().layers, interleaved))
     assert counts.copies_to_host == 2
-    assert store.get(0).interleaved.planes.device == DEVICE
     assert torch.equal(store.get(0).interleaved.planes.cpu(), interleaved.planes.cpu())
 
 

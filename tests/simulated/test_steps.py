@@ -16,7 +16,6 @@ from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 from abcd_ns.engine.train.health.health import LATE_AFTER
 from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
 from tests.reference.device_counts import Counts
 from tests.reference.rasterizer_scenes import as_leaves
@@ -104,21 +103,6 @@ def test_no_more_ram_is_pinned_for_a_block_than_there_is_for_that(counts, monkey
         waits.append(counts.since(before).waited)
         assert all(bool((copy == k).all()) for k, copy in enumerate(copies))
     assert waits == [4, 2, 1]
-
-
-def test_numbers_of_a_step_are_there_a_step_later(counts):
-    numbers = StepNumbers(DEVICE)
-    assert numbers.are_late
-    for step in range(3):
-        given = [torch.full((), float(step), device=DEVICE), torch.full((), 0.5, device=DEVICE)]
-        numbers.send({"losses": given, "bad": []})
-        found = list(numbers.read(all_but=1))
-        assert found == ([{"losses": [step - 1.0, 0.5], "bad": []}] if step else [])
-    assert [found["losses"][0] for found in numbers.read()] == [2.0]
-    assert (counts.copies_to_host, counts.waits["event"]) == (3, 3)
-    at_once = StepNumbers(torch.device("cpu"))
-    at_once.send({"losses": [torch.tensor(2.0)]})
-    assert list(at_once.read(all_but=int(at_once.are_late))) == [{"losses": [2.0]}]
 
 
 @pytest.mark.usefixtures("counts")

@@ -14,7 +14,7 @@ from torch import Tensor
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
 from abcd_ns.lab.results.run import ViewScore
-from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, score, squared_gap
+from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.viewer.images import data_uri
 
@@ -63,12 +63,12 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) ->
     scores, gaps, bar = [], [], {"console": console, "transient": True}
     count = len(pipeline.datamanager.eval_dataset)
     for drawn in track(draw_held_out(pipeline), "Held-out views", total=count, **bar):
-        scores.append(score(drawn))
-        gaps.append(squared_gap(drawn))
+        scores.append(drawn.score)
+        gaps.append(drawn.squared_gap)
     gap, note = ordering_gap(gaps, pipeline.model.tree.num_blocks) if scores else (None, "no held-out view")
     places, shown = pick(scores, pictures), {}
     for drawn in track(draw_held_out(pipeline, places), "Pictures", total=len(places), **bar):
-        row = drawn.view.row
+        row = drawn.row
         shown[row] = _show(drawn, scores[row], places[row], len(places))
     said = note if gap is None else f"{gap:.1f} dB"
     views = evenly([view for view in pipeline.training_views() if view.nearest], FOG_VIEWS)
@@ -94,7 +94,7 @@ def _resized(picture: PictureArray, width: int, height: int) -> str:
 
 
 def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
-    photo, picture = _to_bytes(drawn.view.photo), _to_bytes(drawn.merged)
+    photo, picture = _to_bytes(drawn.photo), _to_bytes(drawn.merged)
     amplified = np.clip(error_map(picture, photo) * ERROR_GAIN, 0, 1)
     error = matplotlib.colormaps[ERROR_COLORS](amplified, bytes=True)[..., :3]
     height, width = photo.shape[:2]

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from statistics import fmean
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -28,11 +27,7 @@ QUALITY = {"psnr_merged": "held-out PSNR (dB)", "ssim_merged": "held-out SSIM"}
 
 
 def shares_of(texts: Sequence[str]) -> list[Fraction]:
-    """The budgets, the largest first.
-
-    Raises:
-        UserError: one is no share.
-    """
+    """The budgets, the largest first; a UserError where one is no share."""
     try:
         found = {Fraction(text) for text in texts}
     except (ValueError, ZeroDivisionError):
@@ -43,11 +38,7 @@ def shares_of(texts: Sequence[str]) -> list[Fraction]:
 
 
 def within_budgets(plan: Plan, ceilings: Results, methods: Sequence[str], shares: Sequence[Fraction]) -> Plan:
-    """The plan, and methods within shares of the memory that joint training took.
-
-    Raises:
-        UserError: that came to nothing.
-    """
+    """The plan, and methods within shares of the memory of joint training; a UserError where that failed."""
     took = [run.gaussian_bytes for run in ceilings.runs if run.method == JOINT]
     if not took:
         raise UserError(f"{JOINT} failed, of whose memory the budgets are shares; see its log.")
@@ -76,10 +67,7 @@ def draw_budgets(results: Results, out: Path) -> list[Path]:
         axes.set(xscale="log", xlabel="peak memory of Gaussians (MiB)", ylabel=title)
         for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
             which(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "125" else "")
-    settings, means = results.settings, f", {results.means_of}" if results.means_of else ""
-    figure.suptitle(
-        f"{settings.scene}, 1/{settings.downscale} size, {settings.budget}{means}", x=0.02, ha="left"
-    )
+    figure.suptitle(results.title, x=0.02, ha="left")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return [save(figure, out, "memory_accuracy")]
 
@@ -88,16 +76,16 @@ def _draw_method(axes: Axes, method: str, arms: Sequence[Arm], field: str) -> No
     """A line through its budgets, bars from the lowest seed to the highest; dotted what no limit gives."""
     look = {"color": COLORS[method], "marker": MARKERS[method]}
     if within := [arm for arm in arms if _is_budgeted(arm)]:
-        means = [_mean(arm, field) for arm in within]
+        means = [arm.mean(field) for arm in within]
         ends = [[getattr(run, field) for run in arm.runs] for arm in within]
         bars = [[mean - min(e), max(e) - mean] for mean, e in zip(means, ends, strict=True)]
         x = list(map(_mebibytes, within))
         axes.errorbar(x, means, list(zip(*bars, strict=True)), label=f"{method} within a budget", **look)
     for arm in arms:
         if not _is_budgeted(arm):
-            axes.axhline(_mean(arm, field), color=look["color"], linewidth=0.8, linestyle=":")
+            axes.axhline(arm.mean(field), color=look["color"], linewidth=0.8, linestyle=":")
             label = f"{method} without a limit"
-            axes.plot([_mebibytes(arm)], [_mean(arm, field)], linestyle="", label=label, **look)
+            axes.plot([_mebibytes(arm)], [arm.mean(field)], linestyle="", label=label, **look)
 
 
 def _is_budgeted(arm: Arm) -> bool:
@@ -105,8 +93,4 @@ def _is_budgeted(arm: Arm) -> bool:
 
 
 def _mebibytes(arm: Arm) -> float:
-    return fmean(run.gaussian_bytes for run in arm.runs) / MIB
-
-
-def _mean(arm: Arm, field: str) -> float:
-    return fmean(getattr(run, field) for run in arm.runs)
+    return arm.mean("gaussian_bytes") / MIB

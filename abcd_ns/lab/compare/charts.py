@@ -80,11 +80,7 @@ def _begin(results: Results) -> tuple[Figure, Axes]:
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     lay_grid(axes)
-    if (settings := results.settings) is not None:
-        blocks = [f"{settings.blocks} block{'s' * (settings.blocks > 1)}"] if settings.blocks else []
-        means = [results.means_of] if results.means_of else []
-        parts = [settings.scene, f"1/{settings.downscale} size", *blocks, settings.budget, *means]
-        axes.set_title(", ".join(parts), loc="left")
+    axes.set_title(results.title, loc="left")
     return figure, axes
 
 
@@ -93,11 +89,11 @@ def _draw_memory(results: Results) -> Figure:
     figure, axes = _begin(results)
     left_out = {left.method for left in results.left_out}
     for method in results.methods:
-        arms = sorted(results.of(method), key=lambda arm: arm.gaussians)
+        arms = sorted(results.of(method), key=lambda arm: arm.mean("gaussians"))
         for name, field, line in (("RAM", "peak_rss_bytes", "-"), ("GPU", "peak_device_bytes", "--")):
             known = [arm for arm in arms if all(getattr(run, field) is not None for run in arm.runs)]
-            x = [arm.gaussians for arm in known]
-            y = [fmean(getattr(run, field) for run in arm.runs) / MIB for arm in known]
+            x = [arm.mean("gaussians") for arm in known]
+            y = [arm.mean(field) / MIB for arm in known]
             ended = ", then out of memory" if method in left_out and name == "GPU" else ""
             look = {"color": COLORS[method], "marker": MARKERS[method], "linestyle": line}
             if known:

@@ -170,11 +170,7 @@ def compare(
 
 
 def read_options(path: Path) -> Options:
-    """Options from a TOML file whose keys are the names of the command line's options.
-
-    Raises:
-        UserError: the file is absent, is no TOML, or has a key or value that does not fit.
-    """
+    """Options from a TOML file whose keys are the command line's names; a UserError where that is not so."""
     values = read_toml(path, f"--config {path} does not exist.")
     if isinstance(values.get("blocks"), int):
         values["blocks"] = [values["blocks"]]
@@ -260,11 +256,7 @@ def terrain_jobs(
 
 def arms_of(given: Options) -> list[tuple[str, ...]]:
     """What each arm changes: every number of blocks, if there are several, with nothing, each price, each of
-    --vary.
-
-    Raises:
-        UserError: an option does not exist, or a value does not fit.
-    """
+    --vary. A UserError where an option does not exist, or a value does not fit."""
     check_numbers("--blocks", given.blocks, 1)
     for price in given.prices:
         if not 0 <= price < math.inf:

@@ -66,11 +66,7 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """What `write_json` wrote.
-
-    Raises:
-        RecordError: the file is absent, or is no JSON, which has no NaN and no infinity.
-    """
+    """What `write_json` wrote; a RecordError where there is no JSON, which has no NaN and no infinity."""
     try:
         return msgspec.json.decode(path.read_bytes())
     except FileNotFoundError:
@@ -110,11 +106,7 @@ def own_configs(trains: bool) -> list[Path]:
 
 
 def read_record(path: Path, cls: type[R], schema: int) -> R:
-    """A record with a field `schema`, as `write_json` wrote it.
-
-    Raises:
-        RecordError: the file is absent, of another schema, or does not fit the schema.
-    """
+    """A record with a field `schema`, as `write_json` wrote it; a RecordError where it is of another."""
     data = read_json(path)
     found = data.get("schema") if isinstance(data, dict) else None
     if found != schema:

@@ -34,15 +34,9 @@ class Arm:
         """The method, and what of it is set."""
         return self.method if self.variant == "default" else f"{self.method} {self.variant}"
 
-    @property
-    def psnr(self) -> float:
-        """Held out, merged, dB; mean over the seeds."""
-        return fmean(run.psnr_merged for run in self.runs)
-
-    @property
-    def gaussians(self) -> float:
-        """At the end, mean over the seeds."""
-        return fmean(run.gaussians for run in self.runs)
+    def mean(self, field: str) -> float:
+        """Over the seeds, of a field of `Run` that all of them know."""
+        return fmean(getattr(run, field) for run in self.runs)
 
 
 @dataclass(frozen=True)
@@ -108,6 +102,15 @@ class Results:
         runs = sorted(len(arm.runs) for arm in self.arms) or [1]
         few = "" if runs[0] == runs[-1] else f"{runs[0]} to "
         return f"mean of {few}{runs[-1]} seeds" if runs[-1] > 1 else ""
+
+    @property
+    def title(self) -> str:
+        """Scene, size, blocks, budget and seeds, as charts have them; empty where nothing is held out."""
+        if (s := self.settings) is None:
+            return ""
+        blocks = [f"{s.blocks} block{'s' * (s.blocks > 1)}"] if s.blocks else []
+        means = [self.means_of] if self.means_of else []
+        return ", ".join([s.scene, f"1/{s.downscale} size", *blocks, s.budget, *means])
 
     def of(self, method: str) -> tuple[Arm, ...]:
         """The method's arms, in their order."""

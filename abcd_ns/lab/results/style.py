@@ -1,15 +1,10 @@
 """How charts look: colours, marks and type, the same in all of them."""
 
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-P, R = ParamSpec("P"), TypeVar("R")
 
 LOOKS = {
     "abcd-monolithic": ("#D55E00", "s"),
@@ -50,15 +45,8 @@ def save(figure: Figure, out: Path, name: str) -> Path:
     return path
 
 
-def in_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """A function that draws in the style of all charts."""
-
-    @wraps(draw)
-    def styled(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return styled
+in_style = matplotlib.rc_context(STYLE)
+"""Decorates a function that draws in the style of all charts."""
 
 
 def lay_grid(axes: Axes) -> None:

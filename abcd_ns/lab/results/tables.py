@@ -91,12 +91,14 @@ def headline(outcomes: Sequence[Outcome]) -> str:
 
 
 def _of_arms(arms: Sequence[Arm], labels: Mapping[str, str]) -> str:
-    best, worst = (pick(arms, key=lambda arm: arm.psnr) for pick in (max, min))
-    fewest = min((arm for arm in arms if best.psnr - arm.psnr <= NEAR_DB), key=lambda arm: arm.gaussians)
+    psnrs = {arm.name: arm.mean("psnr_merged") for arm in arms}
+    best, worst = max(psnrs, key=psnrs.get), min(psnrs, key=psnrs.get)
+    enough = [arm for arm in arms if psnrs[best] - psnrs[arm.name] <= NEAR_DB]
+    fewest = min(enough, key=lambda arm: arm.mean("gaussians"))
     return (
-        f"Best: {labels[best.name]}, {best.psnr:.2f} dB. Worst: {labels[worst.name]}, {worst.psnr:.2f} dB. "
-        f"Gap: {best.psnr - worst.psnr:.2f} dB. Fewest Gaussians within {NEAR_DB:g} dB of the best: "
-        f"{fewest.gaussians:,.0f} ({labels[fewest.name]}, {fewest.psnr:.2f} dB)."
+        f"Best: {labels[best]}, {psnrs[best]:.2f} dB. Worst: {labels[worst]}, {psnrs[worst]:.2f} dB. "
+        f"Gap: {psnrs[best] - psnrs[worst]:.2f} dB. Fewest Gaussians within {NEAR_DB:g} dB of the best: "
+        f"{fewest.mean('gaussians'):,.0f} ({labels[fewest.name]}, {psnrs[fewest.name]:.2f} dB)."
     )
 
 
@@ -116,13 +118,15 @@ def cell(runs: Sequence[Run], measure: Measure) -> str:
     """The measure of an arm's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
     parts = measure.field.split(".")
     values = [reduce(lambda record, name: getattr(record, name, None), parts, run) for run in runs]
-    if not values or any(value is None for value in values):
+    if None in values:
         return NOTHING
     return mean_of([value / measure.unit for value in values], f",.{measure.digits}f")
 
 
 def mean_of(values: Sequence[float], form: str) -> str:
     """Mean and standard deviation (n - 1), the latter of several values only, in a format of Python's."""
+    if not values:
+        return NOTHING
     deviation = "" if len(values) == 1 else f" ± {stdev(values):{form.lstrip('+')}}"
     return f"{fmean(values):{form}}{deviation}"
 
@@ -142,22 +146,26 @@ def rows(results: Results) -> Rows:
     return [list(column) for column in zip(*table, strict=True)] if many else table
 
 
+def _pairs(arm: Arm, other: Arm | None) -> list[tuple[Run, Run]]:
+    """Runs of both on the same seeds."""
+    theirs = {run.seed: run for run in other.runs} if other else {}
+    return [(run, theirs[run.seed]) for run in arm.runs if run.seed in theirs]
+
+
 def _difference(arm: Arm, results: Results) -> str:
     """Of merged PSNR to the arm without changes, over the seeds that both have."""
-    base = results.baseline(arm)
-    theirs = {run.seed: run.psnr_merged for run in base.runs} if base and results.settings else {}
-    pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
-    return mean_of(pairs, "+.2f") if pairs else NOTHING
+    pairs = _pairs(arm, results.baseline(arm)) if results.settings else []
+    return mean_of([ours.psnr_merged - theirs.psnr_merged for ours, theirs in pairs], "+.2f")
 
 
 def _worst_view(arm: Arm, results: Results) -> str:
     """How far a held-out view lies from the same of abcd-monolithic, in the view where that is worst."""
-    arms = results.of("abcd-monolithic")[:1] if results.settings else ()
-    joint = {run.seed: run for one in arms for run in one.runs}
-    pairs = [(run, joint[run.seed]) for run in arm.runs if run.seed in joint and joint[run.seed] is not run]
-    views = [zip(run.views, other.views, strict=True) for run, other in pairs]
-    found = [min(ours.psnr_merged - theirs.psnr_merged for ours, theirs in pair) for pair in views]
-    return mean_of(found, "+.2f") if found else NOTHING
+    joint = next(iter(results.of("abcd-monolithic")), None)
+    pairs = _pairs(arm, joint) if results.settings and joint is not arm else []
+    views = (zip(ours.views, theirs.views, strict=True) for ours, theirs in pairs)
+    return mean_of(
+        [min(our.psnr_merged - their.psnr_merged for our, their in pair) for pair in views], "+.2f"
+    )
 
 
 def notes(results: Results) -> list[str]:

@@ -24,7 +24,7 @@ from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
-_REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name.startswith("abcd")}
+_REGISTERED = {m: getattr(methods, m.replace("-", "_")).config for m in METHODS if m.startswith("abcd")}
 
 
 def trainer_config(job: Job, out: Path) -> TrainerConfig:
@@ -44,20 +44,12 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
 
 
 def check_scene(job: Job) -> None:
-    """Look at the scene as a worker would, photos included.
-
-    Raises:
-        UserError: it cannot be trained on.
-    """
+    """Raise a UserError if the scene cannot be trained on, photos included."""
     inspect(_parser(job))
 
 
 def check_options(job: Job) -> None:
-    """Check that the options that the job changes go together.
-
-    Raises:
-        UserError: they do not.
-    """
+    """Raise a UserError if the options that the job changes do not go together."""
     if not job.changes:
         return
     pipeline = _abcd(job).pipeline
@@ -68,11 +60,11 @@ def check_options(job: Job) -> None:
 
 def registered(method: str) -> AbcdTrainerConfig | None:
     """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
-    return _REGISTERED[method].config if method in _REGISTERED else None
+    return _REGISTERED.get(method)
 
 
 def _abcd(job: Job) -> AbcdTrainerConfig:
-    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method].config)
+    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method])
     settings, pipeline = job.settings, config.pipeline
     pipeline.datamanager.data = Path(settings.data)
     pipeline.datamanager.dataparser = _parser(job)

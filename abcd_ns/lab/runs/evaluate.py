@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
@@ -22,77 +20,62 @@ Picture = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
-class HeldOutView:
-    """A view that no method is trained on."""
+class Drawn:
+    """A view that no method is trained on, and what a trained model makes of it; pictures are 0..1."""
 
     row: int
     name: str
-    camera: Cameras
     photo: Picture
     """On the model's background where the file has an alpha channel."""
-    mask: Bool[Tensor, "h w 1"] | None = None
+    mask: Bool[Tensor, "h w 1"] | None
     """Where it counts; None for everywhere."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A held-out view and what a trained model makes of it, 0..1."""
-
-    view: HeldOutView
     merged: Picture
-    composited: Picture
-
-
-def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
-    """All held-out views in order, one photo in memory at a time where the datamanager allows."""
-    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
-    background = model.background_color.to(model.device)
-    for row, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
-        photo = model.composite_with_background(model.get_gt_img(batch["image"]), background)
-        yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo, batch.get("mask"))
-
-
-def draw_merged(model: SplatfactoModel, camera: Cameras) -> Picture:
     """All Gaussians at once, as any viewer draws them."""
-    if isinstance(model, AbcdModel):
-        return _on_background(model.draw_merged(model.view(camera)).layer, model)
-    return model.get_outputs_for_camera(camera)["rgb"]
+    composited: Picture | None
+    """Block by block. For a model without blocks both are the same picture; None where it was not drawn."""
+
+    @property
+    def psnr(self) -> float:
+        """Of the merged picture, dB."""
+        return float(psnr(counted(self.merged, self.mask), counted(self.photo, self.mask)))
+
+    @property
+    def score(self) -> ViewScore:
+        """How close both pictures come to the photo."""
+        composited, merged = (
+            image_metrics(picture, self.photo, mask=self.mask) for picture in (self.composited, self.merged)
+        )
+        scores = (composited["psnr"], composited.get("ssim"), composited.get("lpips"))
+        return ViewScore(self.row, self.name, *scores, merged["psnr"], merged.get("ssim"))
+
+    @property
+    def squared_gap(self) -> float:
+        """Mean squared difference of the merged and the composited picture."""
+        return float((self.merged - self.composited).double().square().mean())
 
 
-def mean_psnr(pipeline: VanillaPipeline) -> float:
-    """Mean over the held-out views of the merged pictures' PSNR, dB."""
+def draw_held_out(
+    pipeline: VanillaPipeline, rows: Collection[int] | None = None, composited: bool = True
+) -> Iterator[Drawn]:
+    """Every held-out view, or those at `rows`, in order; photos are read one at a time where possible.
+
+    Args:
+        composited: draw the blocks one by one, too.
+    """
+    model, names = pipeline.model, pipeline.datamanager.eval_dataset.image_filenames
+    background = model.background_color.to(model.device)
     with undisturbed(pipeline):
-        pairs = ((draw_merged(pipeline.model, v.camera), v.photo, v.mask) for v in held_out_views(pipeline))
-        scores = [float(psnr(counted(drawn, mask), counted(photo, mask))) for drawn, photo, mask in pairs]
-    return sum(scores) / len(scores)
-
-
-def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None) -> Iterator[Drawn]:
-    """Every held-out view, or those at `rows`, in the order of the rows: all Gaussians at once, and block by
-    block. For a model without blocks both are the same picture."""
-    model = pipeline.model
-    with undisturbed(pipeline):
-        for view in held_out_views(pipeline):
-            if rows is None or view.row in rows:
-                merged = composited = draw_merged(model, view.camera)
-                if isinstance(model, AbcdModel):
-                    composited = _on_background(model.draw_composited(model.view(view.camera)), model)
-                yield Drawn(view, merged, composited)
-
-
-def score(drawn: Drawn) -> ViewScore:
-    """How close both pictures come to the photo."""
-    view = drawn.view
-    composited, merged = (
-        image_metrics(picture, view.photo, mask=view.mask) for picture in (drawn.composited, drawn.merged)
-    )
-    scores = (composited["psnr"], composited.get("ssim"), composited.get("lpips"))
-    return ViewScore(view.row, view.name, *scores, merged["psnr"], merged.get("ssim"))
-
-
-def squared_gap(drawn: Drawn) -> float:
-    """Mean squared difference of the merged and the composited picture."""
-    return float((drawn.merged - drawn.composited).double().square().mean())
+        for row, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
+            if rows is not None and row not in rows:
+                continue
+            photo = model.composite_with_background(model.get_gt_img(batch["image"]), background)
+            if isinstance(model, AbcdModel):
+                view = model.view(camera)
+                merged = _on_background(model.draw_merged(view).layer, model)
+                blocks = _on_background(model.draw_composited(view), model) if composited else None
+            else:
+                merged = blocks = model.get_outputs_for_camera(camera)["rgb"]
+            yield Drawn(row, names[row].name, photo, batch.get("mask"), merged, blocks)
 
 
 def ordering_gap(squared_gaps: Sequence[float], blocks: int) -> tuple[float | None, str | None]:

@@ -14,6 +14,7 @@ import tyro
 
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import nearest
+from abcd_ns.nerfstudio.run.settings import flat_options
 
 LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "max_gaussians": 0, "pictures": 0}
 """The least that a number may be, by option; 1 for those that are not here."""
@@ -51,14 +52,7 @@ def words(metavar: str, *aliases: str) -> Any:
 
 
 def check_ranges(given: Mapping[str, int | None], low: int = 1) -> None:
-    """Check that every number is as large as it must be; None is passed over.
-
-    Args:
-        low: the least that those may be that `LOWEST` does not name.
-
-    Raises:
-        UserError: one is not.
-    """
+    """Raise a UserError if a number is below `LOWEST`, or `low` where that does not name it; None is none."""
     for name, value in given.items():
         least = LOWEST.get(name, low)
         if value is not None and value < least:
@@ -66,22 +60,15 @@ def check_ranges(given: Mapping[str, int | None], low: int = 1) -> None:
 
 
 def check_numbers(option: str, numbers: Sequence[int], low: int) -> None:
-    """Check that a list has different numbers from `low` up.
-
-    Raises:
-        UserError: it has not.
-    """
+    """Raise a UserError unless a list has different numbers from `low` up."""
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < low:
         text = " ".join([option, *map(str, numbers)])
         raise UserError(f"{text}: give different numbers from {low} up.")
 
 
 def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:
-    """One or several changes, `name=value name=value`, each checked against the options of `pipeline`.
-
-    Raises:
-        UserError: a name or value does not fit, or an option may not be varied.
-    """
+    """One or several changes, `name=value name=value`; a UserError where one does not fit `pipeline`, or may
+    not be varied."""
     found, known = {}, option_names(pipeline)
     for word in text.split():
         name, equals, value = word.partition("=")
@@ -110,14 +97,11 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
     """Set options to what a file says of them, in place. What is not one word keeps its default.
 
     Args:
-        where: the file; begins every message.
-
-    Raises:
-        UserError: there is no such option, or the value is not of its type.
+        where: the file; begins the message of a UserError about what does not fit.
     """
-    known = option_names(config)
+    known, more = option_names(config), flat_options(config)
     for path, value in values.items():
-        if path not in known and not _leads_somewhere(config, path):
+        if path not in known and path not in more:
             raise UserError(f"{where}: there is no option {path!r} in this version of abcd_ns.")
         if path not in known:
             continue
@@ -128,11 +112,7 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The type of every option that can be written as one word, by its dotted name.
-
-    Args:
-        prefix: begins every name.
-    """
+    """The type of every option that can be written as one word, by its dotted name after `prefix`."""
     hints, found = typing.get_type_hints(type(config)), {}
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), prefix + field.name
@@ -146,11 +126,7 @@ def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def read_value(path: str, text: str, known: Mapping[str, Any]) -> Any:
-    """The value that a word gives an option, by the option's type in `option_names`.
-
-    Raises:
-        UserError: there is no such option, or the value is not of its type.
-    """
+    """The value that a word gives an option, by its type in `option_names`; a UserError where it does not."""
     if path not in known:
         near = " or ".join(nearest(path, known))
         said = f"did you mean {near}?" if near else "docs/reference.md lists them, under --pipeline."
@@ -176,17 +152,6 @@ def _set(config: Any, path: str, value: Any) -> None:
         _set(config, way, dataclasses.replace(owner, **{last: value}))
     else:
         setattr(owner, last, value)
-
-
-def _leads_somewhere(config: Any, path: str) -> bool:
-    """Whether the path is that of a value that is not one word, or of a part of one."""
-    for step in path.split("."):
-        if not dataclasses.is_dataclass(config):
-            return True
-        if not hasattr(config, step):
-            return False
-        config = getattr(config, step)
-    return True
 
 
 def _alternatives(hint: Any) -> tuple[Any, ...]:

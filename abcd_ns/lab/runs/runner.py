@@ -150,11 +150,7 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
 
 @contextmanager
 def taking(out: Path) -> Iterator[None]:
-    """Around what makes a user's folder one of ours and marks it.
-
-    Raises:
-        UserError: the operating system does not let it.
-    """
+    """Make a UserError of what the operating system says about writing to a user's folder."""
     try:
         yield
     except OSError as error:
@@ -162,11 +158,8 @@ def taking(out: Path) -> Iterator[None]:
 
 
 def take_folder(out: Path, marker: Path, kind: str) -> bool:
-    """Whether `out` is there already, with its marker; it is made where it is absent.
-
-    Raises:
-        UserError: it is a file, or a folder of something else.
-    """
+    """Whether `out` is there already, with its marker; it is made where it is absent. A UserError where it is
+    a file, or a folder of something else."""
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; name a folder.")
     if not marker.exists() and out.is_dir() and any(out.iterdir()):
@@ -230,9 +223,7 @@ def run_job(job: Job, out: Path) -> Run | Failure:
 
 def last_line(log: Path) -> str:
     """The last line with anything in it, or ""."""
-    with open(log, "rb") as stream:
-        stream.seek(max(0, log.stat().st_size - 8192))
-        lines = stream.read().decode("utf-8", "replace").replace("\r", "\n").splitlines()
+    lines = log.read_text("utf-8", "replace").splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 

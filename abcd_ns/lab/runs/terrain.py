@@ -31,6 +31,8 @@ from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.run import STORE
 
+RAM_BYTES = 16 << 20
+"""For blocks that were read, smaller than any scene; layers and photos have their own."""
 WHOLE_STEPS = 12
 """Enough for Adam's moments and the drawing of the largest view to be there."""
 
@@ -85,16 +87,14 @@ def run(job: TerrainJob, folder: Path) -> Run:
 
 def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
     """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
-    whole = job.method == "abcd-monolithic"
+    whole, tiles = job.method == "abcd-monolithic", range(land.tiles)
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
-    if whole:
-        everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
-        store.commit({0: BlockState.fresh(everything).packed()})
-        return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
-    for tile, block in enumerate(tree.assign(land.middles).tolist()):
-        store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
-    return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
+    blocks = {0: tiles} if whole else {b: [t] for t, b in enumerate(tree.assign(land.middles).tolist())}
+    for block, own in blocks.items():
+        gaussians = Gaussians.cat([land.make_tile(tile) for tile in own])
+        store.commit({block: BlockState.fresh(gaussians).packed()})
+    return StoredScene(tree, store, RAM_BYTES)
 
 
 def _coordinator(

@@ -15,7 +15,6 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from PIL import Image
-from torch import Tensor
 
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
@@ -28,7 +27,7 @@ from abcd_ns.formats.scene_file import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import draw_held_out, mean, mean_psnr, ordering_gap, score, squared_gap
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap
 from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
@@ -169,7 +168,7 @@ class Training:
         self._moments = [moment for moment in self._moments if moment > progress]
         (self.coordinator or self.stopwatch).pause()
         began, seconds, steps = time.perf_counter(), self.stopwatch.seconds, self.steps
-        found = mean_psnr(self.pipeline)
+        found = mean([drawn.psnr for drawn in draw_held_out(self.pipeline, composited=False)])
         self.points.append(CurvePoint(seconds, steps, found, self.gaussians))
         self.seconds_of_looks += time.perf_counter() - began
         if self.coordinator is None:
@@ -223,18 +222,14 @@ def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[V
     shown = set(evenly(range(len(training.pipeline.datamanager.eval_dataset)), job.settings.pictures))
     scores, gaps = [], []
     for drawn in draw_held_out(training.pipeline):
-        scores.append(score(drawn))
-        gaps.append(squared_gap(drawn))
-        if drawn.view.row in shown:
+        scores.append(drawn.score)
+        gaps.append(drawn.squared_gap)
+        if drawn.row in shown:
             pictures.mkdir(exist_ok=True)
-            save_png(pictures / f"photo-{drawn.view.row:04d}.png", drawn.view.photo)
-            save_png(pictures / f"merged-{drawn.view.row:04d}.png", drawn.merged)
+            for kind in ("photo", "merged"):
+                picture = (getattr(drawn, kind) * 255).round().byte().cpu().numpy()
+                Image.fromarray(picture).save(pictures / f"{kind}-{drawn.row:04d}.png")
     return scores, gaps
-
-
-def save_png(path: Path, picture: Tensor) -> None:
-    """Write a picture, float [h, w, 3] in 0..1, with 8 bits a channel."""
-    Image.fromarray((picture * 255).round().byte().cpu().numpy()).save(path)
 
 
 if __name__ == "__main__":

@@ -70,11 +70,7 @@ def stability(
 
 
 def choose(only: Sequence[str]) -> list[Scenario]:
-    """The scenarios asked for, in their order; all if none is named.
-
-    Raises:
-        UserError: there is none of that id.
-    """
+    """The scenarios of these ids, in their order; all if none is given. A UserError for an unknown id."""
     for name in sorted(set(only) - set(SCENARIOS)):
         raise UserError(f"--only {name}: there is no such scenario; there are {', '.join(SCENARIOS)}.")
     return [scenario for name, scenario in SCENARIOS.items() if not only or name in only]

@@ -144,7 +144,7 @@ class Lab:
         coordinator = self.coordinator(stage, method, **{"density": LIMITED, **options})
         while not coordinator.finished:
             train_step(coordinator, stage)
-        gaussians = merged(coordinator)
+        gaussians = coordinator.scene.everything("cpu")
         return Trained(gaussians, self.score(gaussians, stage))
 
     def score_of_table(self, method: Method) -> float:
@@ -163,11 +163,6 @@ class Lab:
         """Mean PSNR of merged pictures of the held-out views, dB."""
         drawn = self.pictures(gaussians, stage.held_out)
         return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
-
-
-def merged(coordinator: Coordinator) -> Gaussians:
-    """All blocks in one list, in the order of the blocks, on the CPU and without a graph."""
-    return coordinator.scene.everything("cpu")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Finding, Lab, Stage, make_stage, merged, scenario
+from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Finding, Lab, Stage, make_stage, scenario
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, Wall, World, camera, ring
 
 FEW = 3
@@ -118,17 +118,17 @@ def old_layers(lab: Lab) -> Finding:
     usual = {"budget": BUDGET // 2, "warmup": 0.0, "recipe": Recipe(heal=False, passes=2)}
     usual["density"] = DensityConfig(strategy="off")
     coordinator = lab.coordinator(stage, **usual)
-    errors = [full_error(lab, stage, merged(coordinator))]
+    errors = [full_error(lab, stage, coordinator.scene.everything("cpu"))]
 
     def listen(event: Event) -> None:
         if isinstance(event, VisitEnded):
-            errors.append(full_error(lab, stage, merged(coordinator)))
+            errors.append(full_error(lab, stage, coordinator.scene.everything("cpu")))
 
     coordinator.announce.subscribe(listen)
     while not coordinator.finished:
         train_step(coordinator, stage)
     rising = mean(after > (1 + RISES_BY) * before for before, after in pairwise(errors))
-    score = lab.score(merged(coordinator), stage)
+    score = lab.score(coordinator.scene.everything("cpu"), stage)
     said = {"abcd": f"{rising:.0%} of visits raised the objective, {score:.2f} dB"}
     return Finding(rising <= VISITS_RISING, said, {"rising": rising, "psnr": score})
 
@@ -249,7 +249,7 @@ def fog(lab: Lab) -> Finding:
         while not coordinator.finished:
             train_step(coordinator, replace(stage, photos=dark))
             if coordinator.state.step % 50 == 0:
-                shares.append(share_of_fog(lab, merged(coordinator), stage.views))
+                shares.append(share_of_fog(lab, coordinator.scene.everything("cpu"), stage.views))
         most[method] = max(shares)
         said[method] = f"{most[method]:.1%} of the screen at most"
     return Finding(max(most.values()) < FOG, said, {f"fog {name}": value for name, value in most.items()})

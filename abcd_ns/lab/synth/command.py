@@ -58,11 +58,7 @@ class Settings:
     """Rays per pixel along each axis."""
 
     def check(self) -> None:
-        """Whether all of them can be drawn.
-
-        Raises:
-            UserError: one is out of range.
-        """
+        """Raise a UserError if one is out of range."""
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if not low <= value <= high:
@@ -141,11 +137,11 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:
             nearby = [c for k in around for c in range(k * count, (k + 1) * count)]
             rng = site.rng("points", court)
             parts.append(court_points(world, views, own, nearby, settings.points_per_court, rng))
-    points = SparsePoints.cat(parts)
-    if not len(points.xyz):
+    points = sum(len(part.xyz) for part in parts)
+    if not points:
         raise UserError("No point is seen by two views; raise --views-per-court or --points-per-court.")
-    write_model(out / "sparse" / "0", dict(zip(names, views, strict=True)), points)
-    return len(views), len(points.xyz)
+    write_model(out / "sparse" / "0", dict(zip(names, views, strict=True)), parts)
+    return len(views), points
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Scene points with their observations, as structure from motion would leave them, and the model of these."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,28 +25,15 @@ _SLACK = 1e-3
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """P points and their O observations."""
+    """P points and who observes them."""
 
     xyz: NDArray[np.float64]
     """[P, 3] metres, world."""
     rgb: NDArray[np.uint8]
     """[P, 3] sRGB."""
-    point: NDArray[np.int64]
-    """[O] which point is observed."""
-    camera: NDArray[np.int64]
-    """[O] index of the camera that sees it, in the list of all cameras."""
-    xy: NDArray[np.float64]
-    """[O, 2] where, in pixels (pixel centres at +0.5)."""
-
-    @staticmethod
-    def cat(parts: list["SparsePoints"]) -> "SparsePoints":
-        """All parts in one, points numbered through."""
-        starts = np.cumsum([0] + [len(p.xyz) for p in parts[:-1]])
-        columns = {
-            name: np.concatenate([getattr(p, name) for p in parts]) for name in ("xyz", "rgb", "camera", "xy")
-        }
-        points = np.concatenate([p.point + s for p, s in zip(parts, starts, strict=True)])
-        return SparsePoints(point=points, **columns)
+    seen: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]
+    """By camera, in the list of all cameras: which points it observes, ascending, and where, [n, 2] in pixels
+    (pixel centres at +0.5)."""
 
 
 def court_points(
@@ -67,14 +55,11 @@ def court_points(
     order = order[np.sum([visible for visible, _ in seen], axis=0)[order] >= 2]
     sky_rank = np.cumsum(is_sky.numpy()[order])
     order = order[~is_sky.numpy()[order] | (sky_rank <= _SKY_SHARE * count)][:count]
-    found = [np.flatnonzero(visible[order]) for visible, _ in seen]
-    return SparsePoints(
-        xyz.numpy()[order],
-        rgb.numpy()[order],
-        np.concatenate(found),
-        np.concatenate([np.full(len(mine), c) for c, mine in zip(nearby, found, strict=True)]),
-        np.concatenate([xy[order][mine] for (_, xy), mine in zip(seen, found, strict=True)]),
-    )
+    found = {}
+    for camera, (visible, xy) in zip(nearby, seen, strict=True):
+        rows = np.flatnonzero(visible[order])
+        found[camera] = rows, xy[order][rows]
+    return SparsePoints(xyz.numpy()[order], rgb.numpy()[order], found)
 
 
 def _through_pixels(
@@ -97,30 +82,30 @@ def _observe(world: SunlitWorld, view: View, xyz: Tensor) -> tuple[NDArray[np.bo
     return visible.numpy(), xy.numpy()
 
 
-def write_model(folder: Path, cameras: dict[str, View], points: SparsePoints) -> None:
+def write_model(folder: Path, cameras: dict[str, View], parts: Sequence[SparsePoints]) -> None:
     """Write cameras.bin, images.bin and points3D.bin with one shared pinhole camera, by the writer that
     nerfstudio has of COLMAP's own.
 
-    Ids count from 1: image i is the i-th of `cameras`, by its file's name; point j is row j - 1 of `points`.
+    Ids count from 1: image i is the i-th of `cameras`, by its file's name; points are numbered through.
     Stored errors are 0, because observations are exact projections.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    order = np.lexsort((points.point, points.camera))
-    rows = np.searchsorted(points.camera[order], np.arange(len(cameras) + 1))
-    slot = np.empty(len(order), np.int64)
-    slot[order] = np.arange(len(order)) - rows[points.camera[order]]
-    images, tracks = {}, {}
+    starts = np.cumsum([0, *(len(part.xyz) for part in parts)])
+    tracks: list[list[tuple[int, int]]] = [[] for _ in range(starts[-1])]
+    images, points = {}, {}
     for i, (name, view) in enumerate(cameras.items()):
-        mine = order[rows[i] : rows[i + 1]]
+        seen = [(start + part.seen[i][0], part.seen[i][1]) for start, part in zip(starts, parts, strict=False)
+                if i in part.seen]  # fmt: skip
+        rows, xy = map(np.concatenate, zip(*seen, strict=True))
+        for slot, row in enumerate(rows.tolist()):
+            tracks[row].append((i + 1, slot))
         turn = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
         pose = turn[[3, 0, 1, 2]], view.viewmat[:3, 3]
-        images[i] = colmap.Image(i + 1, *pose, 1, name, points.xy[mine], points.point[mine] + 1)
-    by_point = np.lexsort((points.camera, points.point))
-    ends = np.searchsorted(points.point[by_point], np.arange(len(points.xyz) + 1))
-    for j, (xyz, rgb) in enumerate(zip(points.xyz, points.rgb, strict=True)):
-        track = by_point[ends[j] : ends[j + 1]]
-        tracks[j] = colmap.Point3D(j + 1, xyz, rgb, 0.0, points.camera[track] + 1, slot[track])
+        images[i] = colmap.Image(i + 1, *pose, 1, name, xy, rows + 1)
+    xyz, rgb = (np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "rgb"))
+    for j, track in enumerate(tracks):
+        points[j] = colmap.Point3D(j + 1, xyz[j], rgb[j], 0.0, *np.array(track).T)
     view = next(iter(cameras.values()))
     (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
     shared = colmap.Camera(1, "PINHOLE", view.width, view.height, (fx, fy, cx, cy))
-    colmap.write_model({1: shared}, images, tracks, folder)
+    colmap.write_model({1: shared}, images, points, folder)

@@ -19,6 +19,10 @@ from abcd_ns.lab.world.world import Seen, World, camera
 
 HEIGHT = 1.1
 """Of the cameras over the land, in sides of a tile."""
+VIEWS = 4
+"""Cameras over each tile."""
+SIZE = (160, 120)
+"""Of their pictures, pixels."""
 SHIFT = 0.25
 """How far to either side of its tile's middle a camera stands."""
 WAVES = ((3.1, 1.7, 0.2), (-2.3, 4.1, 1.1), (7.9, -5.3, 2.0), (11.3, 13.7, 0.7))
@@ -32,10 +36,6 @@ class Land(World):
     tiles: int
     gaussians: int
     """In each tile."""
-    views: int = 4
-    """Cameras over each tile."""
-    width: int = 160
-    height: int = 120
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -85,12 +85,12 @@ class Land(World):
         found = []
         for tile in range(self.tiles):
             x, y = self.corner(tile)
-            for k in range(self.views):
-                angle = 2 * math.pi * (k + 0.5) / self.views
+            for k in range(VIEWS):
+                angle = 2 * math.pi * (k + 0.5) / VIEWS
                 across = math.cos(angle), math.sin(angle)
                 eye = (x + 0.5 + SHIFT * across[0], y + 0.5 + SHIFT * across[1], HEIGHT)
                 target = (x + 0.5 - 0.1 * SHIFT * across[0], y + 0.5 - 0.1 * SHIFT * across[1], 0.0)
-                found.append(replace(camera(eye, target, len(found), (self.width, self.height)), near=0.2))
+                found.append(replace(camera(eye, target, len(found), SIZE), near=0.2))
         return found
 
     def crop(self, view: View, crop: Crop) -> Float[Tensor, "h w 3"]:

@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, make_plan, read_options
-from abcd_ns.lab.job import METHODS, Settings
+from abcd_ns.lab.job import METHODS
 from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import check_options, trainer_config
 
@@ -17,17 +15,6 @@ CONFIGS = own_configs(trains=False)
 
 def options(scene: Path, **given) -> Options:
     return Options(**{"data": str(scene), "out": "out", "steps": 10, **given})
-
-
-def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
-    plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), seeds=(3, 1)))
-    assert [(job.method, job.seed) for job in plan.jobs] == [
-        ("abcd-monolithic", 3),
-        ("abcd", 3),
-        ("abcd-monolithic", 1),
-        ("abcd", 1),
-    ]
-    assert len({job.folder(plan.out) for job in plan.jobs}) == 4
 
 
 @pytest.mark.parametrize("method", [method for method in METHODS if method.startswith("abcd")])
@@ -50,27 +37,19 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"out": None}, "--out"),
         ({"steps": None}, "either --seconds or --steps"),
         ({"seconds": 5.0}, "either --seconds or --steps"),
-        ({"steps": 0}, "--steps is 0"),
-        ({"steps": None, "seconds": 0.0}, "--seconds is 0.0"),
         ({"steps": None, "seconds": float("nan")}, "--seconds is nan"),
-        ({"blocks": (0,)}, "--blocks 0: give different numbers from 1 up"),
         ({"blocks": (2, 2)}, "--blocks 2 2: give different numbers"),
-        ({"blocks": ()}, "--blocks: give different numbers"),
         ({"blocks": (1, 65_537)}, "--blocks is 65537; it must be at most 65536"),
         ({"prices": (-1.0,)}, "--prices -1: a price is 0 or more"),
-        ({"prices": (float("nan"),)}, "--prices nan: a price is 0 or more"),
         ({"prices": (1.0, 1.0000001)}, "'training.density.price=1' is given twice"),  # told to six digits
         ({"vary": ("training.batch=1", "training.btach=2")}, "no option 'training.btach'"),
         ({"vary": ("blocks=2", "blocks=2")}, "'blocks=2' is given twice"),
         ({"vary": ("blocks=2",), "blocks": (1, 8)}, "'blocks=2' is given twice"),
-        ({"downscale": 0}, "--downscale is 0"),
-        ({"evals": 0}, "--evals is 0"),
         ({"max_gaussians": -1}, "--max-gaussians is -1"),
         ({"methods": ()}, "at least one"),
         ({"methods": ("abcd", "abcd")}, "each once"),
         ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
         ({"seeds": (1, 1)}, "different numbers"),
-        ({"seeds": (-1,)}, "different numbers"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, given, message):
@@ -91,12 +70,19 @@ def names_of(plan) -> list[tuple[str, str]]:
     return [(job.method, job.variant) for job in plan.jobs]
 
 
-def test_several_numbers_of_blocks_are_an_arm_each_of_every_method_that_has_any(tmp_path):
-    plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), blocks=(4, 1), seeds=(0, 1)))
-    once = [("abcd-monolithic", "default"), ("abcd", "blocks=1"), ("abcd", "blocks=4")]
+def test_every_method_with_every_seed_block_count_and_change_has_a_folder_of_its_own(tmp_path):
+    methods = ("splatfacto", "abcd", "abcd-monolithic")
+    given = {"blocks": (4, 1), "seeds": (3, 1), "vary": ("training.batch=1",)}
+    plan = make_plan(options(tmp_path, methods=methods, **given))
+    batch = "training.batch=1"
+    once = [("abcd-monolithic", "default"), ("abcd-monolithic", batch)]
+    once += [("abcd", f"blocks={n}{more}") for n in (1, 4) for more in ("", f" {batch}")]
+    once += [("splatfacto", "default")]
     assert names_of(plan) == 2 * once
-    assert [trainer_config(job, tmp_path).pipeline.blocks for job in plan.jobs[:3]] == [1, 1, 4]
-    assert plan.jobs[1].folder(Path("out")) == Path("out/runs/abcd/blocks=1-seed-0")
+    assert [job.seed for job in plan.jobs] == [3] * 7 + [1] * 7
+    assert [trainer_config(job, tmp_path).pipeline.blocks for job in plan.jobs[:6]] == [1, 1, 1, 1, 4, 4]
+    assert plan.jobs[2].folder(Path("out")) == Path("out/runs/abcd/blocks=1-seed-3")
+    assert len({job.folder(plan.out) for job in plan.jobs}) == 14
     assert "--blocks 4 1" in plan.command
 
 
@@ -110,17 +96,6 @@ def test_prices_and_changes_are_arms_beside_the_method_as_it_is(tmp_path):
     assert [c.training.density.price for c in configs][1:3] == [8.0, 0.5]
     assert [c.blocks for c in configs] == [4, 4, 4, 4, 27]
     assert "--prices 8 0.5 --vary training.warmup=0 'partition=grid blocks=27'" in plan.command
-
-
-def test_every_change_is_made_with_every_number_of_blocks(tmp_path):
-    plan = make_plan(options(tmp_path, blocks=(1, 8), vary=("training.batch=1",)))
-    sizes = [(f"blocks={n}", f"blocks={n} training.batch=1") for n in (1, 8)]
-    assert [name for _, name in names_of(plan)] == [name for pair in sizes for name in pair]
-
-
-def test_splatfacto_has_none_of_the_options(tmp_path):
-    plan = make_plan(options(tmp_path, methods=("abcd", "splatfacto"), prices=(4.0,), blocks=(1, 2)))
-    assert [name for method, name in names_of(plan) if method == "splatfacto"] == ["default"]
 
 
 @pytest.mark.parametrize(
@@ -147,9 +122,7 @@ def test_the_examples_make_plans(path, tmp_path):
     [
         ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
         ("blocks = 'three'", r"Expected array \| null, got str - at blocks"),
-        ("methods = ['abcd', 3]", r"got int - at methods\[1\]"),
         ("methods = ['nerfacto']", "nerfacto"),
-        ("seeds = 0", r"Expected array \| null, got int - at seeds"),
         ("blocks = ", "cannot be read as TOML"),
     ],
 )
@@ -160,12 +133,3 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
         read_options(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@given(st.integers(1, 50))
-def test_moments_rise_to_the_end_of_the_run(evals):
-    settings = Settings("scene", 1, 8, None, 100, evals, 0, True, 3)
-    assert len(settings.moments) == evals
-    assert list(settings.moments) == sorted(set(settings.moments))
-    assert settings.moments[0] > 0
-    assert settings.moments[-1] == 1

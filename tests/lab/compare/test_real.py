@@ -10,6 +10,7 @@ from rich.console import Console
 
 from abcd_ns.cli.export.command import export
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
+from abcd_ns.lab.results.run import CurvePoint
 from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
 from tests.reference.colmap_scene import HELD_OUT, write_scene
@@ -64,39 +65,8 @@ def test_runs_report_what_was_asked_for(compared):
         assert run.peak_rss_bytes > 100 << 20
         assert run.store_bytes > 0
         assert run.method in printed
-
-
-@pytest.mark.cli
-def test_a_runs_log_has_the_curve_for_its_report(compared):
-    results, plan, _ = compared
-    for job, run in zip(plan.jobs, results.runs, strict=True):
-        lines = map(json.loads, (job.folder(plan.out) / "abcd" / "log.jsonl").read_text().splitlines())
-        scores = [line["psnr"] for line in lines if line["kind"] == "held out"]
-        assert scores == [point.psnr for point in run.curve[:-1]]
-        assert len(scores) == 2
-
-
-@pytest.mark.cli
-def test_curves_rise_in_time_to_the_final_score(compared):
-    results, plan, _ = compared
-    for run in results.runs:
-        seconds, steps = ([getattr(p, name) for p in run.curve] for name in ("seconds", "steps"))
-        assert len(run.curve) == plan.settings.evals
-        assert seconds == sorted(seconds)
-        assert steps == sorted(set(steps))
-        assert run.curve[-1].psnr == run.psnr_merged
-        assert (seconds[-1], steps[-1]) == (run.train_seconds, STEPS)
-        assert run.curve[-1].gaussians == run.gaussians
-        assert all(point.gaussians > 0 for point in run.curve)
-        for share, point in zip(plan.settings.moments, run.curve, strict=True):
-            assert point.steps == int(np.ceil(share * STEPS))
-
-
-@pytest.mark.cli
-def test_blocks_and_layers_are_accounted_for(compared):
-    single, blocks = compared[0].runs
+    single, blocks = results.runs
     assert (single.blocks, blocks.blocks) == (1, 2)
-    assert single.ordering_gap_db is None
     assert single.ordering_gap_note
     assert single.layer_seconds < blocks.layer_seconds < blocks.train_seconds
     assert single.psnr == pytest.approx(single.psnr_merged, abs=1e-4)
@@ -106,16 +76,26 @@ def test_blocks_and_layers_are_accounted_for(compared):
 
 
 @pytest.mark.cli
-def test_reports_are_there_and_a_second_call_trains_nothing(compared):
+def test_curves_rise_in_time_to_the_final_score_as_in_the_runs_log(compared):
     results, plan, _ = compared
-    pictures = [path.name for path in (plan.out / "pictures").iterdir()]
-    assert pictures == ["view-0001.png"]
+    for job, run in zip(plan.jobs, results.runs, strict=True):
+        seconds = [point.seconds for point in run.curve]
+        assert seconds == sorted(seconds)
+        assert [point.steps for point in run.curve] == [np.ceil(s * STEPS) for s in plan.settings.moments]
+        assert all(point.gaussians > 0 for point in run.curve)
+        end = CurvePoint(run.train_seconds, STEPS, run.psnr_merged, run.gaussians)
+        assert run.curve[-1] == end
+        lines = map(json.loads, (job.folder(plan.out) / "abcd" / "log.jsonl").read_text().splitlines())
+        scores = [line["psnr"] for line in lines if line["kind"] == "held out"]
+        assert scores == [point.psnr for point in run.curve[:-1]]
+
+
+@pytest.mark.cli
+def test_reports_are_there_and_name_no_folder_of_this_machine(compared):
+    _, plan, _ = compared
+    assert [path.name for path in (plan.out / "pictures").iterdir()] == ["view-0001.png"]
     for name in ("table.md", "speed_accuracy.png", "size_accuracy.png", "memory.png"):
         assert (plan.out / name).stat().st_size > 0
-    stream = StringIO()
-    assert carry_out(plan, Console(file=stream, width=100)) == 0
-    assert stream.getvalue().count("reused") == 2
-    assert read_results(plan.out / "results.json").runs == results.runs
-    text = (plan.out / "results.json").read_text()  # it names no folder of this machine
+    text = (plan.out / "results.json").read_text()
     assert str(plan.out.parent) not in text
     assert f"{Path.home()}/" not in text

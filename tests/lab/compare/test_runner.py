@@ -16,7 +16,7 @@ from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.job import Job, Plan
 from abcd_ns.lab.results.records import encode
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs.runner import last_line, run_jobs
+from abcd_ns.lab.runs.runner import run_jobs
 from tests.lab.compare.records import MACHINE, read_results
 
 
@@ -41,11 +41,14 @@ def with_settings(plan: Plan, **changed) -> Plan:
     return dataclasses.replace(plan, settings=settings, jobs=jobs)
 
 
-def test_finished_runs_are_reused(plan, worker):
+def test_finished_runs_are_reused_and_spoilt_ones_are_not(plan, worker):
     first = run(plan)
     assert [outcome.method for outcome in first] == worker.calls() == ["abcd-monolithic", "abcd"]
     assert run(plan) == first
     assert worker.calls() == []
+    (plan.jobs[0].folder(plan.out) / "run.json").write_text('{"psnr": NaN}')
+    assert run(plan) == first
+    assert worker.calls() == ["abcd-monolithic"]
 
 
 def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
@@ -58,14 +61,6 @@ def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
     assert [outcome.method for outcome in run(plan)] == ["abcd-monolithic", "abcd"]
     assert worker.calls() == ["abcd"]
     assert not (half / "leftover").exists()
-
-
-def test_a_spoilt_run_is_run_again(plan, worker):
-    run(plan)
-    worker.calls()
-    (plan.jobs[0].folder(plan.out) / "run.json").write_text('{"psnr": NaN}')
-    run(plan)
-    assert worker.calls() == ["abcd-monolithic"]
 
 
 @pytest.mark.parametrize(
@@ -87,47 +82,20 @@ def test_a_failed_run_is_reported_and_the_others_go_on(plan, worker, behaviour, 
     assert [type(outcome) for outcome in run(plan)] == [Run, Run]
 
 
-def test_a_comparison_with_a_failure_still_writes_everything(plan, worker):
-    worker.behave(abcd="raises")
-    stream = StringIO()
-    assert carry_out(plan, Console(file=stream, width=100)) == 1
-    results = read_results(plan.out / "results.json")
-    assert [found.method for found in results.runs] == ["abcd-monolithic"]
-    assert [failure.method for failure in results.failures] == ["abcd"]
-    for name in ("table.md", "speed_accuracy.png", "memory.png"):
-        assert (plan.out / name).stat().st_size > 0
-    assert "ValueError: the scene is empty" in (plan.out / "table.md").read_text()
-    assert "PSNR" in stream.getvalue()
-
-
-@pytest.mark.usefixtures("worker")
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("steps", 11), ("blocks", 2), ("downscale", 2), ("densify", False), ("data", "other")],
-)
-def test_another_protocol_is_refused_by_name(plan, field, value):
+def test_another_protocol_or_machine_is_refused_by_name_until_overwritten(plan, worker, monkeypatch):
     run(plan)
-    with pytest.raises(UserError, match=rf"holds runs with {field} .*, not {value}") as caught:
-        run(with_settings(plan, **{field: value}))
-    assert "\n" not in str(caught.value)
-
-
-def test_runs_of_another_machine_are_refused(plan, worker, monkeypatch):
-    run(plan)
-    other = dataclasses.replace(MACHINE, cores=64)
-    monkeypatch.setattr("abcd_ns.lab.runs.runner.describe_machine", lambda: other)
     worker.calls()
-    with pytest.raises(UserError, match="holds runs with cores 2, not 64"):
-        run(plan)
+    for field, value in (("steps", 11), ("blocks", 2), ("densify", False), ("data", "other")):
+        other = with_settings(plan, **{field: value})
+        with pytest.raises(UserError, match=rf"holds runs with {field} .*, not {value}"):
+            run(other)
     assert worker.calls() == []
-
-
-def test_overwrite_drops_the_runs(plan, worker):
-    run(plan)
-    worker.calls()
-    other = with_settings(plan, steps=11)
     run(other, overwrite=True)
     assert worker.calls() == ["abcd-monolithic", "abcd"]
+    larger = dataclasses.replace(MACHINE, cores=64)
+    monkeypatch.setattr("abcd_ns.lab.runs.runner.describe_machine", lambda: larger)
+    with pytest.raises(UserError, match="holds runs with cores 2, not 64"):
+        run(other)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -139,9 +107,9 @@ def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     assert [path.name for path in plan.out.iterdir()] == ["thesis.tex"]
 
 
-def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan, tmp_path):
-    (tmp_path / "file").write_text("")
-    inside = tmp_path / "file" / "out"
+def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan):
+    inside = plan.out.parent / "scene.txt" / "out"
+    inside.parent.write_text("")
     with pytest.raises(UserError, match=rf"^{inside} cannot be written: Not a directory; name"):
         run(dataclasses.replace(plan, out=inside))
 
@@ -163,19 +131,22 @@ def test_a_wrong_name_on_the_command_line_is_one_line_and_nothing_is_written(pla
     assert not plan.out.exists()
 
 
-def test_a_change_that_failed_is_named_and_the_others_are_reported(plan, worker):
+def test_a_change_that_failed_is_named_and_all_is_written(plan, worker):
     worker.behave({"training.batch=1": "raises"})
     options = Options(data=plan.settings.data, out=str(plan.out), steps=10)
     varied = make_plan(dataclasses.replace(options, vary=("training.batch=1", "training.warmup=0")))
-    assert carry_out(varied, Console(file=StringIO())) == 1
+    stream = StringIO()
+    assert carry_out(varied, Console(file=stream, width=100)) == 1
+    assert "PSNR" in stream.getvalue()
     assert worker.calls() == ["abcd", "abcd training.batch=1", "abcd training.warmup=0"]
     results = read_results(plan.out / "results.json")
     assert [arm.variant for arm in results.arms] == ["default", "training.warmup=0"]
     assert [failure.variant for failure in results.failures] == ["training.batch=1"]
     text = (plan.out / "table.md").read_text()
     assert "abcd, training.batch=1, seed 0 failed" in text
-    assert carry_out(varied, Console(file=StringIO())) == 1
-    assert worker.calls() == ["abcd training.batch=1"]  # the others are reused
+    assert "ValueError: the scene is empty" in text
+    for name in ("speed_accuracy.png", "memory.png"):
+        assert (plan.out / name).stat().st_size > 0
 
 
 def test_splatfacto_is_left_out_with_a_reason_where_gaussians_are_limited(plan, worker):
@@ -189,12 +160,3 @@ def test_splatfacto_is_left_out_with_a_reason_where_gaussians_are_limited(plan, 
         ("splatfacto", True),
         ("splatfacto-scaled", True),
     ]
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [(b"", ""), (b"\n \n", ""), (b"a\nb\n\n", "b"), (b"10%\r20%\r", "20%"), (b"\xff\n", "\ufffd")],
-)
-def test_last_line_of_a_log(tmp_path, content, expected):
-    (tmp_path / "log").write_bytes(content)
-    assert last_line(tmp_path / "log") == expected

@@ -34,11 +34,14 @@ def test_failures_and_losses_to_one_block_are_said_and_read_back(tmp_path):
     assert headline([GOOD]) == "1 of 1 scenarios pass."
 
 
-def test_only_known_scenarios_are_chosen():
+def test_only_known_scenarios_are_chosen(tmp_path):
     assert [scenario.id for scenario in choose(["A14", "A11"])] == ["A11", "A14"]
     assert [scenario.id for scenario in choose([])] == list(SCENARIOS)
     with pytest.raises(UserError, match="--only A99: there is no such scenario; there are A11,"):
         choose(["A99"])
+    for wrong in (["--only", "Z9"], ["--seed", "-1"]):
+        assert cli.main(["stability", "--out", str(tmp_path / "out"), *wrong]) == 2
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path, capsys):
@@ -71,10 +74,3 @@ def test_the_command_writes_a_report(tmp_path, capsys, monkeypatch):
     assert cli.main(["stability", "--out", str(out), "--only", "A5"]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (out / "results.json").read_bytes() == before
-
-
-@pytest.mark.parametrize("wrong", [["--only", "Z9"], ["--seed", "-1"]])
-def test_what_is_refused_takes_no_folder(tmp_path, wrong):
-    out = tmp_path / "out"
-    assert cli.main(["stability", "--out", str(out), *wrong]) == 2
-    assert not out.exists()
