@@ -14,15 +14,14 @@ PHOTOS = (1, 2, 8)
 def memory_table() -> str:
     """Millions of Gaussians in a block; a dash where not even a small one fits."""
     lines = [
-        "| photos, views in a step | " + " | ".join(f"{budget} GiB" for budget in BUDGETS) + " |",
+        "| photos | " + " | ".join(f"{budget} GiB" for budget in BUDGETS) + " |",
         "| --- |" + " ---: |" * len(BUDGETS),
     ]
     for megapixels in PHOTOS:
-        for views in (4, 1):
-            needs = DeviceNeeds(megapixels * 10**6, views)
-            limits = [needs.block_limit(budget << 30) / 1e6 for budget in BUDGETS]
-            cells = [f"{limit:.1f} million" if limit > 0 else "-" for limit in limits]
-            lines.append(f"| {megapixels} megapixels, {views} | " + " | ".join(cells) + " |")
+        needs = DeviceNeeds(megapixels * 10**6, batch=1, waiting=3)
+        limits = [needs.block_limit(budget << 30) / 1e6 for budget in BUDGETS]
+        cells = [f"{limit:.1f} million" if limit > 0 else "-" for limit in limits]
+        lines.append(f"| {megapixels} megapixels | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

@@ -13,7 +13,7 @@ from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
@@ -96,6 +96,23 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat):
     per_pixel = (two - one) / huge
     slope = (large - small) / (many - few)
     assert slope <= per_pixel <= LAVISH * slope
+
+
+def test_what_a_frozen_gaussian_takes_while_layers_are_drawn(tmp_path, simulated_gsplat):
+    peaks = []
+    for gaussians in (800, 1600):
+        options = {"gaussians": gaussians, "width": 32, "blocks": 4, "density": STILL}
+        coordinator, _ = run_on(tmp_path / str(gaussians), **options)
+        layers, view = coordinator.visit.layers, coordinator.state.active.geometry.views[0]
+        layers._store = LayerStore(DEVICE, 1 << 30)
+        held = simulated_gsplat.live_bytes
+        simulated_gsplat.reset_peak()
+        list(layers.draw([view]))
+        frozen = coordinator.count() - len(coordinator.params["means"])
+        peaks.append((frozen, simulated_gsplat.peak_bytes - held))
+    (few, small), (many, large) = peaks
+    slope = (large - small) / (many - few)
+    assert slope <= drawing_bytes(3, "3dgs") <= LAVISH_GAUSSIAN * slope
 
 
 @pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
