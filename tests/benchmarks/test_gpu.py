@@ -91,8 +91,8 @@ def test_all_parts_of_a_dry_run_go_through(tmp_path, capsys):
     assert checks["self_check_2dgs"] < 1e-3
     for part in ("compare", "compare-steps"):
         found = read_json(out / f"{part}.json")["found"]["results"]
-        assert [(arm["method"], arm["variant"]) for arm in found["arms"]] == [("abcd", "blocks=2")]
-        assert found["left_out"][0]["method"] == "splatfacto"
+        arms = [(arm["method"], arm["variant"]) for arm in found["arms"]]
+        assert arms == [("splatfacto", "default"), ("abcd", "blocks=2")]
         assert not list((out / "work" / part).rglob("nerfstudio_models"))
     assert read_json(out / "visit.json")["found"]["by_blocks"][0]["profile"]
     assert len(read_json(out / "extent.json")["found"]["results"]["arms"]) == 2
