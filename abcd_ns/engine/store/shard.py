@@ -23,11 +23,8 @@ _CHUNK = 1 << 20
 def write_shard(
     folder: Path, block: BlockName, generation: int, tensors: Mapping[str, Tensor], meta: dict[str, Any]
 ) -> Shard:
-    """Write a block and sync it; the folder is left for the caller to sync.
-
-    Raises:
-        OSError, safetensors.SafetensorError: the disk refused; nothing is left behind.
-    """
+    """Write a block and sync it; the folder is left for the caller to sync. If the disk refuses, by OSError
+    or SafetensorError, nothing is left behind."""
     name = block if isinstance(block, str) else f"{block:06d}"
     path = folder / f"block-{name}-{generation:08d}.safetensors"
     with replacing(path) as temporary:
