@@ -140,15 +140,9 @@ def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
         AbcdDataset(outputs, scale_factor=0.5)
 
 
-@pytest.mark.parametrize(("kind", "extra"), [("SIMPLE_RADIAL", [0.0]), ("OPENCV", [0.0, 0.0, 0.0, 0.0])])
-def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
-    def params(w, h):
-        focal = [w * 0.9] if kind == "SIMPLE_RADIAL" else [w * 0.9, w * 0.9]
-        return kind, [*focal, w / 2, h / 2, *extra]
-
-    write_model(tmp_path / "zero/sparse/0", params=params)
-    shutil.copytree(scene / "images", tmp_path / "zero/images")
-    outputs = parser(tmp_path / "zero").get_dataparser_outputs()
+def test_zero_distortion_is_a_pinhole(tmp_path):
+    write_capture(tmp_path, params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.0, 0.0, 0.0, 0.0]))
+    outputs = parser(tmp_path).get_dataparser_outputs()
     assert all(source.undistortion is None for source in outputs.metadata["photos"])
 
 

@@ -3,7 +3,7 @@
 import copy
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -135,7 +135,7 @@ class ParameterStore:
         return copy.deepcopy(self._shard(block).meta)
 
     def load(
-        self, block: BlockName, names: Iterable[str] | None = None
+        self, block: BlockName, names: Sequence[str] | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The tensors of a block, on the CPU and owning their memory, and its JSON.
 
@@ -145,9 +145,9 @@ class ParameterStore:
                 this object.
 
         Raises:
-            KeyError: no such block or tensor.
+            KeyError: no such block.
         """
-        tensors, shard = self._read(block, None if names is None else list(names))
+        tensors, shard = self._read(block, names)
         return tensors, copy.deepcopy(shard.meta)
 
     def commit(
@@ -165,12 +165,9 @@ class ParameterStore:
             StoreError: too little space, which is found before anything is written, or a write that failed:
                 the new files are gone, unless the disk refuses even to put the old manifest back;
                 `generation` tells.
-            TypeError, ValueError: something is not JSON, or a block's number is negative.
+            TypeError, ValueError: something is not JSON.
         """
         self._require_writable()
-        for block in updates:
-            if isinstance(block, int) and block < 0:
-                raise ValueError(f"A block's number must not be negative; got {block}.")
         old = self._manifest
         generation = old.generation + 1
         with self._or_roll_back(f"Writing generation {generation} failed"):
@@ -259,7 +256,7 @@ class ParameterStore:
         except KeyError:
             raise KeyError(f"{self.folder} has no block {block}; it has {self.blocks}.") from None
 
-    def _read(self, block: BlockName, names: list[str] | None) -> tuple[dict[str, Tensor], Shard]:
+    def _read(self, block: BlockName, names: Sequence[str] | None) -> tuple[dict[str, Tensor], Shard]:
         while True:
             shard = self._shard(block)
             path = self.folder / shard.file

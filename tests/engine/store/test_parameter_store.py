@@ -66,7 +66,7 @@ def test_some_tensors_can_be_loaded_alone(store):
     tensors, _ = store.load(0, ["means"])
     assert tensors.keys() == {"means"}
     assert torch.equal(tensors["means"], block(3, 1.0)[0]["means"])
-    with pytest.raises(KeyError, match="no tensor 'moments'"):
+    with pytest.raises(StoreError, match="does not contain tensor moments"):
         store.load(0, ["moments"])
     with pytest.raises(KeyError, match="no block 5"):
         store.load(5)
@@ -76,8 +76,6 @@ def test_bad_updates_are_refused_and_change_nothing(store):
     before = names_in(store.folder)
     with pytest.raises(TypeError):
         store.commit({0: block(1), 1: ({}, {"x": object()})})
-    with pytest.raises(ValueError, match="negative"):
-        store.commit({-1: block(1)})
     assert store.generation == 1
     assert names_in(store.folder) == before
 
