@@ -79,7 +79,7 @@ def test_a_command_in_the_documents_is_understood(line):
     parse(line)
 
 
-@pytest.mark.parametrize("line", ["abcd plan --date garden", "ns-train abcd --pipeline.bloks 3", "abcd fly"])
+@pytest.mark.parametrize("line", ["abcd plan --date garden", "ns-eval --bloks 3", "abcd fly"])
 def test_a_wrong_one_would_be_noticed(line):
     with pytest.raises((SystemExit, UserError)):
         parse(line)

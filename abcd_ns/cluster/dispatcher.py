@@ -30,7 +30,8 @@ from abcd_ns.cluster.assignment import (
 from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.assigned_scene import Outlines
-from abcd_ns.engine.store.commit import commit, has_coarse_model, with_pending
+from abcd_ns.engine.store.commit import commit, with_pending
+from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.layer_source import LayerRoom
@@ -92,7 +93,7 @@ class Dispatcher(Coordinator):
     def trains_elsewhere(self) -> bool:
         """Once the warm-up, or a visit that was saved in its midst, is over."""
         state = self.state
-        warms_up = state.visit == 0 and has_coarse_model(self.scene) and self.progress < self.config.warmup
+        warms_up = state.visit == 0 and self.scene.has(DEFERRED) and self.progress < self.config.warmup
         return state.active is None and not warms_up
 
     def await_step(self) -> None:

@@ -66,9 +66,6 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
 
     Returns:
         The scene in a z-up world: `applied_transform` is the change of axes from COLMAP's.
-
-    Raises:
-        InputError: a file is missing, cut or absurd; every bad camera and pose is listed.
     """
     problems, found = Problems(), []
     cameras, listed = (_part(model, name) or model / f"{name}.bin" for name in ("cameras", "images"))

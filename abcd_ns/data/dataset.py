@@ -19,8 +19,8 @@ from torch import Tensor
 from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
-from abcd_ns.data.picture_files import FileFinder, check_complete, read_header
-from abcd_ns.data.scene import Lens, check_lens
+from abcd_ns.data.picture_files import FileFinder, check_complete, read_size
+from abcd_ns.data.scene import Lens, distorted_lens
 from abcd_ns.data.undistort import undistortion
 
 PHOTOS = "photos"
@@ -36,9 +36,6 @@ class AbcdDataset(InputDataset):
         scale_factor: must be 1: the dataparser's `downscale_factor` sets the size of photos.
         budget_bytes: see Photos.
         needs_photos: see `with_photos`.
-
-    Raises:
-        InputError: another scale_factor, or as `with_photos`.
     """
 
     def __init__(
@@ -78,9 +75,6 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
 
     Args:
         needs_photos: False for viewing and exporting, which look at no file.
-
-    Raises:
-        InputError: lists all files that are missing, damaged or unlike their cameras, and other cameras.
     """
     if PHOTOS in outputs.metadata:
         return outputs
@@ -100,16 +94,15 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             stored = lens.size
             if needs_photos:
                 path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
-                header = read_header(path)
-                check_complete(path, header)
-                stored = header.size
+                stored = read_size(path)
+                check_complete(path)
                 if not reduces_to(stored, lens.size):
                     shapes = f"is {stored[0]} x {stored[1]} but its camera is {lens.width} x {lens.height}"
                     raise InputError(f"{path} {shapes}; put the photos there that the model was made from.")
             flat = undistortion(lens) if lens.distorted else None
             mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
             if mask is not None and needs_photos:
-                read_header(mask, check_kind=False)
+                read_size(mask, check_kind=False)
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()
@@ -143,12 +136,7 @@ def _lens(cameras: Cameras, row: int, label: str) -> Lens:
         name = CameraType(kind).name.lower()
         raise InputError(f"{label} is {name}; photos must be perspective or fisheye ones.")
     given = cameras.distortion_params
-    k1, k2, k3, k4, p1, p2 = [0.0] * 6 if given is None else given[row].double().tolist()
-    if kind == _BROWN and k4 != 0:
-        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
+    coefficients = [0.0] * 6 if given is None else given[row].double().tolist()
     fx, fy, cx, cy = (float(getattr(cameras, name)[row]) for name in ("fx", "fy", "cx", "cy"))
-    coefficients = (k1, k2, k3, k4) if kind == _FISHEYE else (k1, k2, p1, p2, k3)
     size = int(cameras.width[row]), int(cameras.height[row])
-    lens = Lens(*size, fx, fy, cx, cy, coefficients, kind == _FISHEYE)
-    check_lens(lens, label)
-    return lens
+    return distorted_lens(Lens(*size, fx, fy, cx, cy, fisheye=kind == _FISHEYE), coefficients, label)

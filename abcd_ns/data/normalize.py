@@ -59,9 +59,6 @@ def normalizing_similarity(
         poses: camera to world, float64 [n, 3, 4], OpenGL convention.
         auto_scale: scale until the farthest camera's largest coordinate is 1.
         scale_factor: on top of it.
-
-    Raises:
-        InputError: the cameras define no orientation or no size.
     """
     middle = poses[..., 3].mean(axis=0)
     near = torch.eye(4).repeat(len(poses), 1, 1)

@@ -12,7 +12,7 @@ from abcd_ns.data.picture_files import (
     FileFinder,
     check_complete,
     is_turned,
-    read_header,
+    read_size,
     visible_files,
 )
 from abcd_ns.data.scene import Frame, Scene
@@ -27,9 +27,6 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
 
     Returns:
         (one source per frame, without undistortion and mask; notes for the user).
-
-    Raises:
-        InputError: lists every photo that is missing, damaged or of the wrong size.
     """
     full = scene.photo_folder
     copies = _reduced_folders(scene)
@@ -71,7 +68,7 @@ def as_stored(scene: Scene) -> Scene:
     finder, problems, sizes = FileFinder(scene.photo_folder, scene.model), Problems(), []
     for frame in scene.frames:
         with problems.collect():
-            sizes.append(read_header(finder.find(frame.name)).size)
+            sizes.append(read_size(finder.find(frame.name)))
         if problems or sizes[0] == frame.lens.size:
             return scene
     pairs = list(zip(sizes, (frame.lens.size for frame in scene.frames), strict=True))
@@ -117,10 +114,10 @@ def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> li
     for frame in frames:
         with problems.collect(name=frame.name):
             path = finder.find(frame.name)
-            header = read_header(path)
-            _check_size(path, header.size, frame, of)
-            check_complete(path, header)
-            files.append(PhotoSource(path, header.size, _reduce(str(path), header.size, factor // of)))
+            size = read_size(path)
+            _check_size(path, size, frame, of)
+            check_complete(path)
+            files.append(PhotoSource(path, size, _reduce(str(path), size, factor // of)))
             if (other := meant.setdefault(path, frame.name)) != frame.name:
                 raise InputError(f"{path} is all there is of {other} and of {frame.name}; copy both there.")
     problems.raise_if_any()

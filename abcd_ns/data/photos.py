@@ -90,11 +90,8 @@ class Photos:
         return self._kept.currsize
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
-        """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it.
-
-        Raises:
-            InputError: the file is gone, damaged or has another size than when it was checked.
-        """
+        """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it. The file may
+        have changed since it was checked."""
         return self._get(("image", index))
 
     def expect(self, indices: Iterable[int]) -> None:
@@ -109,9 +106,6 @@ class Photos:
         """Which pixels count, or None where the photo has no mask. Do not write to it.
 
         A reduced or undistorted pixel counts only if all pixels that it is made of count.
-
-        Raises:
-            InputError: the file is gone, damaged, of another shape than the photo, or hides everything.
         """
         if self.sources[index].mask_path is None:
             return None

@@ -5,7 +5,6 @@ import stat
 import unicodedata
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
 
@@ -29,23 +28,11 @@ _ENDS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
 _PNG_BIT_DEPTH_BYTE = 24
 
 
-@dataclass(frozen=True)
-class Header:
-    """What a picture file says of itself."""
-
-    size: tuple[int, int]
-    """(width, height) as stored: EXIF orientation is not applied, as COLMAP does not."""
-    format: str
-
-
 def check_regular(path: Path, kind: str = "photo") -> None:
     """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes.
 
     Args:
         kind: what it is, for the message.
-
-    Raises:
-        InputError: names `path`.
     """
     try:
         status = path.stat()
@@ -76,9 +63,6 @@ class FileFinder:
 
         Args:
             moved: the folders that come first in the name may be missing, as those of another machine.
-
-        Raises:
-            InputError: the path leaves the folder, and no file inside is meant; or no file can be called so.
         """
         try:
             os.fsencode(name)
@@ -138,11 +122,8 @@ def _without_ending(key: str) -> str:
 
 
 def open_picture(path: Path) -> Image.Image:
-    """Pillow's picture, not yet decoded, of a format among FORMATS.
-
-    Raises:
-        OSError, SyntaxError, ValueError: as Pillow; UnidentifiedImageError is among them.
-    """
+    """Pillow's picture, not yet decoded, of a format among FORMATS. Raises what Pillow does: OSError,
+    SyntaxError, ValueError."""
     return Image.open(path, formats=FORMATS)
 
 
@@ -161,14 +142,12 @@ def undecodable(path: Path, error: Exception) -> InputError:
     return InputError(f"{path} cannot be decoded ({error}); copy the photo again.")
 
 
-def read_header(path: Path, check_kind: bool = True) -> Header:
-    """The header of a photo or mask; reads a few hundred bytes. Not thread-safe (it sets warning filters).
+def read_size(path: Path, check_kind: bool = True) -> tuple[int, int]:
+    """(width, height) of a photo or mask as stored: EXIF orientation is not applied, as COLMAP does not.
+    Reads a few hundred bytes. Not thread-safe (it sets warning filters).
 
     Args:
         check_kind: refuse what is not converted to 8-bit RGB without loss; of masks it does not matter.
-
-    Raises:
-        InputError: missing, empty, a pipe, no picture of FORMATS, over 500 Mpx; or 16 bits deep or CMYK.
     """
     check_regular(path)
     try:
@@ -177,7 +156,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
             with open_picture(path) as picture:
                 if check_kind:
                     _check_kind(path, picture)
-                return Header(picture.size, picture.format or "")
+                return picture.size
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
         raise InputError(f"{path} has more than 500 Mpx; {fix}.") from None
@@ -208,20 +187,15 @@ def _check_kind(path: Path, picture: Image.Image) -> None:
         raise InputError(f"{path} is a {picture.mode} picture; convert it to RGB.")
 
 
-def check_complete(path: Path, header: Header) -> None:
-    """Refuse a cut file, in one short read; only files with a doubtful end are decoded to make sure.
-
-    Raises:
-        InputError: names `path`.
-    """
-    end = _ENDS.get(header.format)
+def check_complete(path: Path) -> None:
+    """Refuse a cut file, in one short read; only files with a doubtful end are decoded to make sure."""
     with path.open("rb") as file:
         file.seek(-min(64, path.stat().st_size), 2)
         tail = file.read()
-    if end is not None and end in tail:
-        return
     try:
         with open_picture(path) as picture:
-            picture.load()
+            end = _ENDS.get(picture.format)
+            if end is None or end not in tail:
+                picture.load()
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None

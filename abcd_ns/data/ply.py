@@ -37,9 +37,6 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Returns:
         (xyz float64 [n, 3], rgb uint8 [n, 3], or None in a file without colours). White is what the type and
         the largest value say: 1 in real numbers, 255, 65535 or 2^32 - 1.
-
-    Raises:
-        InputError: missing, not a .ply with x, y and z in its first element, or not as long as it claims.
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist; correct ply_file_path, or remove it to start at random.")

@@ -17,7 +17,7 @@ from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import as_stored, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.picture_files import read_header, visible_files
+from abcd_ns.data.picture_files import read_size, visible_files
 from abcd_ns.data.ply import GREY
 from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
@@ -95,9 +95,6 @@ def read_scene(
     Args:
         colmap: the folder of COLMAP's model, from `data`; None takes that with most photos.
         images, masks: folders of a COLMAP model's photos and masks, from `data`.
-
-    Raises:
-        InputError: nothing there; says what was looked for, and where known scenes come from.
     """
     whole = data if data.suffix == ".json" else data / f"{TRANSFORMS}.json"
     models = find_models(data) if colmap is None else [data / colmap]
@@ -137,9 +134,6 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
 
     Args:
         needs_photos: False for viewing and exporting, which go on without.
-
-    Raises:
-        InputError: the input cannot be used; all bad files are listed.
     """
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
@@ -202,11 +196,7 @@ def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
 
 
 def check_masks(sources: list[PhotoSource]) -> None:
-    """Decode every mask.
-
-    Raises:
-        InputError: masks that cannot be read, do not fit their photo or hide all of it; lists them all.
-    """
+    """Decode every mask, and list all that cannot be read, do not fit their photo or hide all of it."""
     masked = [source for source in sources if source.mask_path is not None]
     photos, problems = Photos(masked, budget_bytes=0), Problems()
 
@@ -228,7 +218,7 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSou
     for frame in scene.frames:
         if frame.mask_path is not None:
             with problems.collect():  # measured before it is decoded
-                read_header(frame.mask_path, check_kind=False)
+                read_size(frame.mask_path, check_kind=False)
     try:
         with problems.collect():
             files, notes = locate_photos(scene, factor)

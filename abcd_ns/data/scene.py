@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -91,11 +92,7 @@ class Scene:
 
 
 def check_lens(lens: Lens, label: str) -> None:
-    """Refuse what no camera has; lenses are told apart from broken files by wide margins.
-
-    Raises:
-        InputError: named `label`, with the offending value.
-    """
+    """Refuse what no camera has; lenses are told apart from broken files by wide margins."""
     values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     side = max(lens.width, lens.height)
     if not (0 < lens.width <= MAX_SIDE and 0 < lens.height <= MAX_SIDE):
@@ -109,12 +106,18 @@ def check_lens(lens: Lens, label: str) -> None:
         raise InputError(f"{label} has a principal point outside the photo, ({lens.cx:g}, {lens.cy:g}).")
 
 
-def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
-    """`matrix` [3 or 4, 4] as float64 [3, 4] with its rotation made exact (the nearest one).
+def distorted_lens(plain: Lens, coefficients: Sequence[float], label: str) -> Lens:
+    """The lens with nerfstudio's coefficients k1 k2 k3 k4 p1 p2, checked."""
+    k1, k2, k3, k4, p1, p2 = coefficients
+    if k4 != 0 and not plain.fisheye:  # of the 8th power of r
+        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
+    lens = replace(plain, distortion=(k1, k2, k3, k4) if plain.fisheye else (k1, k2, p1, p2, k3))
+    check_lens(lens, label)
+    return lens
 
-    Raises:
-        InputError: named `label`: wrong shape, NaN, infinite, a scale, a shear, a reflection, or too far off.
-    """
+
+def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
+    """`matrix` [3 or 4, 4] as float64 [3, 4] with its rotation made exact (the nearest one)."""
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(f"{label} must be a 4 x 4 or 3 x 4 matrix, not {matrix.shape}.")
     if not np.isfinite(matrix).all():
@@ -132,11 +135,7 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
 
 
 def check_layout(scene: Scene) -> None:
-    """Refuse scenes that no frame of reference can be made for.
-
-    Raises:
-        InputError: fewer than two cameras, one name twice, or all cameras at one place.
-    """
+    """Refuse scenes that no frame of reference can be made for, and names that are there twice."""
     if len(scene.frames) < 2:
         raise InputError(f"{scene.model} has {len(scene.frames)} camera(s), and 2 are needed: add photos.")
     problems = Problems()

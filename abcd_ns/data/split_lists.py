@@ -40,9 +40,6 @@ def split_lists(
         found: what each list names, by split.
         known: the name of each frame, by what lists call it.
         labels: what each list is called in messages, by split.
-
-    Raises:
-        InputError: lists name frames that there are not, or leave nothing to train on or to hold out.
     """
     if not found:
         return None
@@ -73,9 +70,6 @@ def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
 
     Args:
         known: the name of each frame, by what the model calls it.
-
-    Raises:
-        InputError: as `split_lists`, or a list cannot be read.
     """
     found, labels = {}, {}
     for split in SPLITS:

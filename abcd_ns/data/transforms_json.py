@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import FileFinder, read_header
+from abcd_ns.data.picture_files import FileFinder, read_size
 from abcd_ns.data.ply import read_points
-from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, rigid
+from abcd_ns.data.scene import Frame, Lens, Scene, distorted_lens, rigid
 from abcd_ns.data.split_lists import SPLITS, SplitLists, split_lists
 
 TRANSFORMS = "transforms"
@@ -21,7 +21,7 @@ TRANSFORMS = "transforms"
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 LARGEST = sys.float_info.max
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SPELLINGS = (
     (("camera_model",), ("is_fisheye",)),
     (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov")),
@@ -43,10 +43,6 @@ def read_transforms(path: Path) -> Scene:
 
     Returns:
         The scene in the file's world. Frames are sorted by file_path.
-
-    Raises:
-        InputError: not JSON, nothing posed, a bad pose or lens, a path out of the folder; all bad
-            frames are listed.
     """
     meta = _load(path)
     root, problems, frames = path.parent, Problems(), []
@@ -74,14 +70,8 @@ def read_transforms(path: Path) -> Scene:
 
 
 def read_split_transforms(folder: Path) -> Scene:
-    """The scene of transforms_train.json and of transforms_test.json, or else transforms_val.json.
-
-    Returns:
-        The scene, with the points of the first. Its frames are named from `folder` on.
-
-    Raises:
-        InputError: as `read_transforms`, or the two are in different worlds.
-    """
+    """The scene of transforms_train.json and of transforms_test.json, or else transforms_val.json, which must
+    be in one world, with the points of the first. Its frames are named from `folder` on."""
     paths = [folder / f"{TRANSFORMS}_{split}.json" for split in ("train", "test", "val")]
     scenes = [read_transforms(path) for path in [path for path in paths if path.exists()][:2]]
     train, lists = scenes[0], []
@@ -156,7 +146,6 @@ def _frame(path: Path, files: FileFinder, meta: dict, entry: dict, number: int) 
     photo = files.find(name)
     pose = rigid(_matrix(entry.get("transform_matrix"), label), f"{label}: transform_matrix")
     lens = _lens(_camera_values(meta, entry), label, photo)
-    check_lens(lens, label)
     mask = files.find(str(entry["mask_path"])) if entry.get("mask_path") else None
     # As nerfstudio has it, names are relative to the folder that transforms.json lies in.
     return Frame(os.path.relpath(photo, path.parent), pose, lens, mask)
@@ -174,11 +163,7 @@ def _camera_values(meta: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any
 
 
 def _lens(values: dict[str, Any], label: str, photo: Path) -> Lens:
-    """Intrinsics from a frame's values; the size may come from the photo.
-
-    Raises:
-        InputError: a value is no number, or says what is not read.
-    """
+    """Intrinsics from a frame's values; the size may come from the photo."""
     model = str(values.get("camera_model", "OPENCV")).upper()
     if model not in _PINHOLES + _FISHEYES:
         known = ", ".join(_PINHOLES + _FISHEYES)
@@ -191,14 +176,14 @@ def _lens(values: dict[str, Any], label: str, photo: Path) -> Lens:
     if "w" in values and "h" in values:
         width, height = (int(_number(values, key, label)) for key in ("w", "h"))
     else:
-        width, height = read_header(photo).size
+        width, height = read_size(photo)
     focals = [_focal(values, "x", width, label), _focal(values, "y", height, label)]
     given = [focal for focal in focals if focal is not None]
     if not given:
         raise InputError(f"{label} has no focal length; give fl_x or camera_angle_x.")
-    cx, cy = (_number(values, key, label, side / 2) for key, side in (("cx", width), ("cy", height)))
-    distortion = _distortion(values, label, fisheye)
-    return Lens(width, height, given[0], given[-1], cx, cy, distortion, fisheye)
+    center = _number(values, "cx", label, width / 2), _number(values, "cy", label, height / 2)
+    plain = Lens(width, height, given[0], given[-1], *center, fisheye=fisheye)
+    return distorted_lens(plain, _coefficients(values, label), label)
 
 
 def _focal(values: dict[str, Any], axis: str, size: int, label: str) -> float | None:
@@ -214,20 +199,14 @@ def _focal(values: dict[str, Any], axis: str, size: int, label: str) -> float | 
     return None
 
 
-def _distortion(values: dict[str, Any], label: str, fisheye: bool) -> tuple[float, ...]:
-    """OpenCV's order. nerfstudio's k4 of a pinhole is the 8th power of r, which OpenCV does not have."""
-    if "distortion_params" in values:
-        row = _matrix(values["distortion_params"], label).ravel()
-        if len(row) != 6:
-            raise InputError(f"{label}: distortion_params must be k1 k2 k3 k4 p1 p2.")
-        k1, k2, k3, k4, p1, p2 = row.tolist()
-    else:
-        k1, k2, p1, p2, k3, k4 = (_number(values, key, label, default=0.0) for key in _COEFFICIENTS)
-    if fisheye:
-        return (k1, k2, k3, k4)
-    if k4 != 0:
-        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
-    return (k1, k2, p1, p2, k3)
+def _coefficients(values: dict[str, Any], label: str) -> list[float]:
+    """Of the distortion, in the order of _COEFFICIENTS."""
+    if "distortion_params" not in values:
+        return [_number(values, key, label, default=0.0) for key in _COEFFICIENTS]
+    row = _matrix(values["distortion_params"], label).ravel()
+    if len(row) != len(_COEFFICIENTS):
+        raise InputError(f"{label}: distortion_params must be {' '.join(_COEFFICIENTS)}.")
+    return row.tolist()
 
 
 def _photo_folder(root: Path, frames: list[Frame]) -> tuple[Path, list[Frame]]:

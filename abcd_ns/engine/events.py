@@ -150,7 +150,7 @@ class PrunedAtEnd:
     before: float
     """Mean PSNR of these, dB."""
     after: float
-    """The same without who is gone."""
+    """The same without what is gone."""
 
 
 @dataclass(frozen=True)

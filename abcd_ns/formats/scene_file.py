@@ -1,6 +1,6 @@
 """The formats of an exported scene, chosen by the file's suffix, and how large its files would be."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -75,29 +75,16 @@ def write_scene(
 
     Args:
         suffix: of SUFFIXES.
-        count: how many there will be; most formats say so at their beginning.
+        count: how many there are in all parts; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
         antialiased: mark the file so: its opacities are to be compensated for the low-pass filter.
-
-    Raises:
-        RuntimeError: there were more, or fewer.
     """
-    parts = _counted(parts, count)
     if suffix == ".ply":
         write_ply(path, count, sh_degree, parts, antialiased)
     elif suffix == ".glb":
         write_glb(path, count, sh_degree, up, parts, antialiased)
     else:
         path.write_bytes(packed(count, sh_degree, suffix[1:], parts, antialiased))
-
-
-def _counted(parts: Iterable[Gaussians], count: int) -> Iterator[Gaussians]:
-    written = 0
-    for part in parts:
-        yield part
-        written += len(part)
-    if written != count:
-        raise RuntimeError(f"{written} Gaussians were written where {count} were announced")
 
 
 def ply_bytes(gaussians: Gaussians) -> int:

@@ -1,12 +1,11 @@
 """Scenes as users have them: cameras, points and photos are read right."""
 
 import json
-import os
+import math
 import shutil
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
 from hypothesis import given, settings
@@ -27,9 +26,6 @@ from tests.data.dataparser_scenes import (
     write_photos,
     write_transforms,
 )
-
-REAL = Path(os.environ.get("ABCD_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
-"""Where the real scenes are, if they are."""
 
 
 @pytest.mark.parametrize("offset", [0.0, 5e6])
@@ -52,8 +48,9 @@ def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, off
     assert np.array_equal(outputs.metadata["points3D_rgb"].numpy(), np.stack(colors))
 
 
-@pytest.mark.parametrize("center", ["poses", "focus"])
-@pytest.mark.parametrize("orientation", ["up", "pca", "vertical", "none"])
+@pytest.mark.parametrize(
+    ("orientation", "center"), [("up", "poses"), ("pca", "focus"), ("vertical", "focus"), ("none", "poses")]
+)
 def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
     outputs = []
     for name, offset in (("near", 0.0), ("far", 5e6)):
@@ -96,19 +93,20 @@ def test_default_frame_is_nerfstudios(scene):
     assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-5)
 
 
-@given(count=st.integers(2, 60), interval=st.integers(2, 12))
+@given(count=st.integers(2, 60), interval=st.integers(2, 12), share=st.floats(0.5, 0.9))
 @settings(derandomize=True, max_examples=40, deadline=None)
-def test_splits_partition_the_views(count, interval):
-    centers, config = np.zeros((count, 3)), AbcdDataParserConfig(eval_interval=interval)
-    train, test, val = (split_rows(centers, split, config) for split in ("train", "test", "val"))
-    assert test == val == list(range(0, count, interval))
-    assert sorted(train + test) == list(range(count))
-    everything = AbcdDataParserConfig(eval_mode="all")
-    assert (
-        split_rows(centers, "train", everything)
-        == split_rows(centers, "test", everything)
-        == list(range(count))
-    )
+def test_splits_partition_the_views(count, interval, share):
+    def rows(split: str, **options) -> list[int]:
+        return split_rows(np.zeros((count, 3)), split, AbcdDataParserConfig(**options))
+
+    everything, by_interval = list(range(count)), {"eval_interval": interval}
+    assert rows("test", **by_interval) == rows("val", **by_interval) == everything[::interval]
+    assert rows("train", eval_mode="all") == rows("test", eval_mode="all") == everything
+    assert sorted(rows("train", **by_interval) + rows("test", **by_interval)) == everything
+    if share * count <= count - 1:  # else nothing is held out
+        by_share = {"eval_mode": "fraction", "train_split_fraction": share}
+        assert sorted(rows("train", **by_share) + rows("test", **by_share)) == everything
+        assert len(rows("train", **by_share)) == math.ceil(share * count)
 
 
 def test_a_sector_is_held_out_at_an_end_of_the_capture():
@@ -142,15 +140,9 @@ def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
         AbcdDataset(outputs, scale_factor=0.5)
 
 
-@pytest.mark.parametrize(("kind", "extra"), [("SIMPLE_RADIAL", [0.0]), ("OPENCV", [0.0, 0.0, 0.0, 0.0])])
-def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
-    def params(w, h):
-        focal = [w * 0.9] if kind == "SIMPLE_RADIAL" else [w * 0.9, w * 0.9]
-        return kind, [*focal, w / 2, h / 2, *extra]
-
-    write_model(tmp_path / "zero/sparse/0", params=params)
-    shutil.copytree(scene / "images", tmp_path / "zero/images")
-    outputs = parser(tmp_path / "zero").get_dataparser_outputs()
+def test_zero_distortion_is_a_pinhole(tmp_path):
+    write_capture(tmp_path, params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.0, 0.0, 0.0, 0.0]))
+    outputs = parser(tmp_path).get_dataparser_outputs()
     assert all(source.undistortion is None for source in outputs.metadata["photos"])
 
 
@@ -183,27 +175,6 @@ def test_photos_without_pose_are_mentioned(scene, capsys):
     Image.new("RGB", (9, 9)).save(scene / "images/extra.png")
     parser(scene).get_dataparser_outputs()
     assert "1 photos in" in capsys.readouterr().out
-
-
-def test_nerfstudios_datamanager_takes_it(tmp_path):
-    """Distorted cameras: nerfstudio must find nothing left to undistort."""
-    from nerfstudio.data.datamanagers.full_images_datamanager import (
-        FullImageDatamanager,
-        FullImageDatamanagerConfig,
-    )
-
-    write_capture(tmp_path, params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
-    config = FullImageDatamanagerConfig(
-        dataparser=AbcdDataParserConfig(), data=tmp_path, cache_images_type="uint8"
-    )
-    manager = FullImageDatamanager[AbcdDataset](config)
-    parsed = parser(tmp_path).get_dataparser_outputs("test")
-    for (camera, data), wanted in zip(manager.fixed_indices_eval_dataloader, parsed.cameras, strict=True):
-        assert data["image"].shape == (camera.height.item(), camera.width.item(), 3)
-        assert torch.equal(camera.fx.ravel(), wanted.fx.ravel())
-    camera, data = manager.next_train(0)
-    expected = manager.train_dataset.photos.image(camera.metadata["cam_idx"])
-    assert torch.equal(data["image"], expected)
 
 
 def test_a_scene_is_read_once_for_all_splits(scene):
@@ -242,53 +213,3 @@ def test_applied_scale_is_undone_on_the_way_back(scene):
         o.transform_poses_to_original_space(o.cameras.camera_to_worlds) for o in (scaled, centers)
     )
     assert torch.allclose(back[..., 3], quarter[..., 3] / 0.25, atol=1e-5)
-
-
-def test_angle_of_view_and_size_from_the_photo(scene):
-    meta = write_transforms(scene)
-    frames = [
-        {"file_path": f["file_path"], "transform_matrix": f["transform_matrix"]} for f in meta["frames"]
-    ]
-    (scene / "transforms.json").write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames}))
-    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
-    assert torch.allclose(outputs.cameras.fx * 2, outputs.cameras.width.float())
-    assert torch.equal(outputs.cameras.fx, outputs.cameras.fy)
-    assert torch.equal(outputs.cameras.cx * 2, outputs.cameras.width.float())
-
-
-def test_masks_of_all_frames_reach_the_dataset(scene):
-    meta = write_transforms(scene)
-    for frame in meta["frames"]:
-        mask = np.full((frame["h"], frame["w"]), 255, np.uint8)
-        mask[:, : frame["w"] // 2] = 0
-        frame["mask_path"] = frame["file_path"].replace("images", "masks")
-        (scene / frame["mask_path"]).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(mask).save(scene / frame["mask_path"])
-    (scene / "transforms.json").write_text(json.dumps(meta))
-    data = AbcdDataset(parser(scene).get_dataparser_outputs())[0]
-    width = data["image"].shape[1]
-    assert data["mask"].shape == (*data["image"].shape[:2], 1)
-    assert data["mask"].dtype == torch.bool
-    assert not data["mask"][:, : width // 2].any()
-    assert data["mask"][:, width // 2 :].all()
-
-
-@pytest.mark.parametrize("name", ["castle-P30", "fox"])
-@pytest.mark.parametrize("factor", [1, 2])
-def test_real_scene_projects_as_pycolmap_does(name, factor):
-    if not (REAL / name).is_dir():
-        pytest.skip(f"{REAL / name} is not there; set ABCD_DATA to a folder that holds it")
-    model = pycolmap.Reconstruction(str(REAL / name / "sparse/0"))
-    outputs = parser(REAL / name, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
-    dataset = AbcdDataset(outputs)
-    for row in (0, 7):
-        image = model.find_image_with_name(outputs.image_filenames[row].name)
-        camera = model.camera(image.camera_id)
-        xyz = np.stack([point.xyz for _, point in sorted(model.points3D.items())])
-        local = image.cam_from_world() * xyz
-        front = local[:, 2] > 1e-3 * np.abs(local).max()
-        size = np.array([camera.width // factor, camera.height // factor])
-        expected = camera.img_from_cam(local[front]) * size / [camera.width, camera.height]
-        near = np.abs(expected).max(axis=1) < 4 * max(camera.width, camera.height)
-        assert np.abs(project(outputs, row)[front][near] - expected[near]).max() < 1e-2
-        assert dataset.get_numpy_image(row).shape == (*size[::-1], 3)

@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
-from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import (
     NAMES,
-    SIZES,
     parser,
     png_that_claims,
     refusal,
@@ -59,18 +56,6 @@ def test_names_given_twice_and_missing_photos_are_listed_at_once(tmp_path):
     assert len(said.splitlines()) == 3
 
 
-def test_mixed_camera_models_are_one_scene(tmp_path):
-    def params(width: int, height: int) -> tuple[str, list[float]]:
-        if (width, height) == SIZES[0]:
-            return "OPENCV", [width, width, width / 2, height / 2, 0.05, 0.0, 0.0, 0.0]
-        return "PINHOLE", [width, width, width / 2, height / 2]
-
-    write_capture(tmp_path, params=params)
-    flat = {source.stored: source.undistortion for source in parser(tmp_path).prepared().sources}
-    assert flat[SIZES[0]] is not None
-    assert flat[SIZES[1]] is None
-
-
 def test_points_at_absurd_places_are_left_out(tmp_path, capsys):
     write_capture(tmp_path, text=True)
     with (tmp_path / "sparse/0/points3D.txt").open("a") as file:
@@ -103,6 +88,8 @@ def write_masks(scene: Path) -> list[Path]:
 
 def test_masks_of_no_use_are_all_found_before_training(scene):
     masks = write_masks(scene)
+    deep = Image.fromarray(np.full(Image.open(masks[3]).size[::-1], 40_000, np.uint16))
+    deep.save(masks[3])  # a mask for all that
     inspect(parser(scene).config)
     Image.new("L", Image.open(masks[0]).size, 0).save(masks[0])
     Image.new("L", (99, 3), 255).save(masks[1])
@@ -146,24 +133,19 @@ def held_out(scene: Path, **options) -> tuple[list[str], list[str]]:
     return tuple([path.relative_to(scene / "images").as_posix() for path in paths] for paths in outputs)
 
 
-@pytest.mark.parametrize("where", ["files", "transforms"])
+@pytest.mark.parametrize("where", ["test list", "train list", "transforms"])
 def test_lists_of_the_data_decide_what_is_held_out(scene, where):
     wanted = sorted(NAMES)[3:5]
-    if where == "files":
-        (scene / "test_list.txt").write_text("\n".join(wanted) + "\n")
-    else:
+    if where == "transforms":
         rewrite(scene, write_transforms(scene) | {"test_filenames": [f"images/{name}" for name in wanted]})
+    else:  # what one list leaves is on the other side
+        listed = wanted if where == "test list" else set(NAMES) - set(wanted)
+        (scene / where.replace(" ", "_")).with_suffix(".txt").write_text("\n".join(listed) + "\n")
     train, test = held_out(scene)
     assert test == wanted
     assert train == [name for name in sorted(NAMES) if name not in wanted]
     assert held_out(scene, eval_mode="interval")[1] == sorted(NAMES)[::8]
     assert held_out(scene, eval_mode="all") == (sorted(NAMES), sorted(NAMES))
-
-
-def test_what_the_train_list_leaves_is_held_out(scene):
-    (scene / "train_list.txt").write_text("\n".join(NAMES[:7]))
-    train, test = held_out(scene)
-    assert (train, test) == (sorted(NAMES[:7]), sorted(NAMES[7:]))
 
 
 def test_views_in_both_lists_are_mentioned(scene, capsys):
@@ -196,19 +178,3 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
 def test_lists_that_leave_one_side_empty_are_refused(scene, kept, message):
     (scene / "test_list.txt").write_text("\n".join(NAMES[:kept]))
     assert message in refusal(scene)
-
-
-def test_palette_becomes_its_colors(tmp_path):
-    picture = Image.fromarray(
-        np.random.default_rng(0).integers(0, 256, (24, 40, 3), dtype=np.uint8)
-    ).quantize(16)
-    picture.save(tmp_path / "p.png")
-    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
-    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))
-
-
-def test_a_deep_mask_is_a_mask(scene):
-    mask = write_masks(scene)[0]
-    Image.fromarray(np.full(Image.open(mask).size[::-1], 40_000, np.uint16)).save(mask)
-    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
-    assert bool(AbcdDataset(outputs).photos.mask(0).all())

@@ -86,42 +86,36 @@ def test_the_form_of_unicode_does_not_matter(tmp_path, forms):
     assert paths_of(tmp_path) == {f"images/{name}" for name in of_files}
 
 
-def test_a_name_that_could_mean_two_photos_is_refused(tmp_path):
-    write_model(tmp_path / "sparse/0", names=["A.png", "b.png"])
-    write_photos(tmp_path / "images", ["a.png", "b.png", "a.jpg"])
-    assert paths_of(tmp_path) == {"images/a.png", "images/b.png"}
-    write_photos(tmp_path / "images", ["a.PNG"])
-    assert "A.png cannot be read" in refusal(tmp_path)
-
-
-def test_one_photo_is_not_read_for_two_cameras(tmp_path):
-    write_model(tmp_path / "sparse/0", names=["left/0.png", "right/0.png", "1.png"])
-    write_photos(tmp_path / "images", ["0.png", "1.png"])
-    assert "twice" in refusal(tmp_path)
-
-
-def test_many_photos_that_are_not_there_are_one_line(scene):
-    shutil.rmtree(scene / "images/left")
-    said = refusal(scene)
-    assert "left/0000.png cannot be read" in said
-    assert "4 others have the same fault" in said
-    assert "\n" not in said
-
-
-@pytest.mark.parametrize("hidden", ["._0000.png", "@eaDir/0000.png/THUMB_M.jpg", "__MACOSX/0000.png"])
-def test_what_systems_hide_among_photos_is_no_photo(scene, hidden, capsys):
-    path = scene / "images/left" / hidden
+def put(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"x")
-    assert paths_of(scene) == IMAGES
+
+
+def save_transforms(scene: Path, encoding: str) -> None:
+    (scene / "transforms.json").write_bytes(json.dumps(write_transforms(scene)).encode(encoding))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda scene: put(scene / "images/left/._0000.png"),
+        lambda scene: put(scene / "images/left/@eaDir/0000.png/THUMB_M.jpg"),
+        lambda scene: put(scene / "images/left/__MACOSX/0000.png"),
+        lambda scene: save_transforms(scene, "utf-8-sig"),
+        lambda scene: save_transforms(scene, "utf-16"),
+        # No model, whatever it is called.
+        lambda scene: [
+            save_transforms(scene, "utf-8"),
+            put(scene / "cameras.txt"),
+            put(scene / "images.txt"),
+        ],
+        lambda scene: (scene / "images").rename(scene / "Images"),
+    ],
+)
+def test_what_systems_and_other_programs_leave_behind_changes_nothing(scene, change, capsys):
+    change(scene)
+    assert {path.lower() for path in paths_of(scene)} == IMAGES
     assert "no pose" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_json_as_windows_saves_it(scene, encoding):
-    meta = write_transforms(scene)
-    (scene / "transforms.json").write_bytes(json.dumps(meta).encode(encoding))
-    assert paths_of(scene) == IMAGES
 
 
 def test_text_models_as_windows_saves_them(tmp_path):
@@ -158,19 +152,6 @@ def test_a_model_and_photos_flat_in_a_folder(tmp_path, place):
     assert paths_of(tmp_path / "flat") == {f"a b ({k}).png" for k in (1, 2, 3)}
 
 
-def test_the_folder_of_photos_in_another_case(tmp_path):
-    write_model(tmp_path / "sparse/0")
-    write_photos(tmp_path / "Images")
-    assert paths_of(tmp_path) == {name.replace("images", "Images") for name in IMAGES}
-
-
-def test_a_text_file_of_cameras_beside_transforms_is_no_model(scene):
-    write_transforms(scene)
-    (scene / "cameras.txt").write_text("front\n")
-    (scene / "images.txt").write_text("a.png\n")
-    assert paths_of(scene) == IMAGES
-
-
 def test_where_a_model_lies_is_told(scene):
     shutil.move(scene / "sparse", scene / "dense")
     said = refusal(scene)
@@ -197,20 +178,6 @@ def test_a_model_without_points_starts_at_random(tmp_path, text, cloud, capsys):
         path.write_bytes(b"")
     assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
     assert "has no points" in capsys.readouterr().out
-
-
-def test_a_cloud_may_stand_for_a_models_points(scene):
-    wanted = parser(scene).get_dataparser_outputs().metadata
-    model = scene / "sparse/0"
-    shutil.copytree(model, scene / "kept")
-    write_transforms(scene)
-    shutil.copytree(scene / "kept", model)
-    (model / "points3D.bin").unlink()
-    (scene / "points.ply").rename(model / "points3D.ply")
-    (scene / "transforms.json").unlink()
-    found = parser(scene).get_dataparser_outputs().metadata
-    assert found["points3D_xyz"].shape == wanted["points3D_xyz"].shape
-    assert (found["points3D_rgb"] == wanted["points3D_rgb"]).all()
 
 
 @pytest.mark.parametrize("value", [None, ""])

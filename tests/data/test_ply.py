@@ -57,6 +57,12 @@ def test_points_without_colors_are_grey_and_it_is_said(scene, capsys):
     assert "the points have no colours" in capsys.readouterr().out
 
 
+def test_a_cloud_may_stand_for_a_models_points(scene):
+    (scene / "sparse/0/points3D.bin").unlink()
+    write_cloud(scene / "sparse/0/points3D.ply", "uchar", RGB)
+    assert np.array_equal(parser(scene).get_dataparser_outputs().metadata["points3D_rgb"], RGB)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_binary_clouds(tmp_path, order):
     row = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in NAMES]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.data.dataparser_scenes import parser, refusal, write_transforms
+from tests.data.dataparser_scenes import SIZES, parser, refusal, write_transforms
 
 RIGHT_ANGLE = math.pi / 2
 WHERE = pytest.mark.parametrize("where", ["frame", "file"])
@@ -88,7 +88,11 @@ def test_distortion_is_taken_at_either_level(scene, where, values):
     ],
 )
 def test_focal_lengths_by_pixels_and_by_angles(scene, where, values, fx, fy):
-    for lens in lenses(with_camera(scene, where, values, without=("fl_x", "fl_y"))):
+    """The size is the photo's where none is given."""
+    found = lenses(with_camera(scene, where, values, without=("fl_x", "fl_y", "w", "h", "cx", "cy")))
+    assert {lens.size for lens in found} == set(SIZES)
+    for lens in found:
+        assert (lens.cx, lens.cy) == (lens.width / 2, lens.height / 2)
         assert (lens.fx, lens.fy) == pytest.approx((fx(lens.size), fy(lens.size)))
 
 

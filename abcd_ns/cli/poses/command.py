@@ -14,7 +14,7 @@ from rich.console import Console
 from abcd_ns.cli.poses.mapping import Model, Order, Task, find_poses
 from abcd_ns.cli.terminal import few, print_plain
 from abcd_ns.data.input_errors import Problems
-from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_header
+from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_size
 from abcd_ns.errors import UserError
 
 WORK = "poses.part"
@@ -101,9 +101,8 @@ def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
     problems, sizes = Problems(), set()
     for path in found:
         with problems.collect():
-            header = read_header(path)
-            check_complete(path, header)
-            sizes.add(header.size)
+            sizes.add(read_size(path))
+            check_complete(path)
     problems.raise_if_any()
     return tuple(str(path.relative_to(folder)) for path in found), sizes
 

@@ -42,24 +42,21 @@ class AssignedScene(VisitScene):
         self._drawn, self._read = drawn, dict[int, Gaussians]()
         self._live: Callable[[], Gaussians] | None = None
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:  # noqa: ARG002 - its own
-        """From now on the assigned block is what `live` returns."""
+    # What only the active block is asked for is of the assigned one, as its visit found it.
+
+    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:  # noqa: ARG002
         self._live = live
 
-    def state(self, name: BlockName) -> BlockState:  # noqa: ARG002 - its own
-        """The assigned block as its visit found it."""
+    def state(self, name: BlockName) -> BlockState:  # noqa: ARG002
         return self._state
 
-    def pending_for(self, block: int) -> BlockState | None:  # noqa: ARG002 - the assigned block has had it
-        """Nobody waits."""
+    def pending_for(self, block: int) -> BlockState | None:  # noqa: ARG002 - it has had them
         return None
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians of the assigned block as its visit found it."""
         return len(self.state(name))
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
-        """The assigned block as its visit found it."""
         return self.state(block).gaussians
 
     def gaussians(self, block: int) -> Gaussians:

@@ -83,11 +83,7 @@ def without(scene: StoredScene, state: BlockState, blocks: Iterable[int]) -> Blo
 
 
 def commit_coarse_model(scene: StoredScene, state: BlockState) -> dict[BlockName, BlockState]:
-    """Every block with its part of the coarse model and of the deferred points, which are none from then on.
-
-    Raises:
-        KeyError: there are no deferred points.
-    """
+    """Every block with its part of the coarse model and of the deferred points, of which none are left."""
     deferred = scene.state(DEFERRED)
     trained = split_by_block(state, _owner(scene, state))
     arrivals = split_by_block(defer(deferred), _owner(scene, deferred))
@@ -97,11 +93,6 @@ def commit_coarse_model(scene: StoredScene, state: BlockState) -> dict[BlockName
         for block in range(scene.tree.num_blocks)
     }
     return {**committed, DEFERRED: deferred.nobody}
-
-
-def has_coarse_model(scene: StoredScene) -> bool:
-    """Whether the scene begins with a warm-up; there may be no deferred points."""
-    return scene.has(DEFERRED)
 
 
 def _owner(scene: StoredScene, state: BlockState) -> Tensor:

@@ -125,24 +125,23 @@ def read_checked_manifest(path: Path) -> Manifest:
     """
     while True:
         manifest = read_manifest(path)
-        problem = _missing_or_resized(path.parent, manifest)
-        if problem is None:
-            return manifest
-        if read_manifest(path) == manifest:
-            raise StoreError(problem)
-        # A writer has committed meanwhile, and deleted shards of the generation read here.
-
-
-def _missing_or_resized(folder: Path, manifest: Manifest) -> str | None:
-    for shard in manifest.blocks.values():
-        path = folder / shard.file
         try:
-            nbytes = path.stat().st_size
-        except OSError as error:
-            return f"{path} cannot be read: {error.strerror}."
-        if nbytes != shard.nbytes:
-            return f"{path} is damaged: it should have {shard.nbytes} bytes but has {nbytes}."
-    return None
+            for shard in manifest.blocks.values():
+                _check_size(path.parent / shard.file, shard)
+            return manifest
+        except StoreError:
+            if read_manifest(path) == manifest:
+                raise
+            # A writer has committed meanwhile, and deleted shards of the generation read here.
+
+
+def _check_size(path: Path, shard: Shard) -> None:
+    try:
+        nbytes = path.stat().st_size
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+    if nbytes != shard.nbytes:
+        raise StoreError(f"{path} is damaged: it should have {shard.nbytes} bytes but has {nbytes}.")
 
 
 def _compact(body: Any) -> bytes:

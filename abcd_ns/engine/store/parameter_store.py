@@ -3,7 +3,7 @@
 import copy
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +35,11 @@ class ParameterStore:
     leaves the previous generation or the new one. Every byte is checked against the manifest's checksums
     before it is used. One writer at a time, by a lock that dies with its process; readers need none.
     Threads may load while another one commits.
+
+    Raises:
+        StoreError: by all methods: what is read is missing or altered; the disk refuses, and what was there
+            before is intact; or a store that is open for reading is to be changed.
+        FolderLockedError: another writer has the folder that is to be written to.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None):
@@ -46,12 +51,7 @@ class ParameterStore:
 
     @classmethod
     def create(cls, folder: Path | str, header: dict[str, Any]) -> "ParameterStore":
-        """A new store without blocks, at generation 0, open for writing. Makes the folder if need be.
-
-        Raises:
-            StoreError: the folder holds a store already, or cannot be written to.
-            FolderLockedError: another writer has it.
-        """
+        """A new store without blocks, at generation 0, open for writing, in a folder that holds none yet."""
         folder = Path(folder)
         data, path = Manifest(0, header, {}, {}).to_bytes(), manifest_path(folder)
         lock = _claim(folder)
@@ -69,11 +69,6 @@ class ParameterStore:
         """The store in `folder`: its present generation for writing, or for reading alone if `read_only`.
 
         With `name`, the generation pinned under that name, for reading alone.
-
-        Raises:
-            StoreError: no such folder, store or pin; another format version; a damaged manifest; a shard
-                that is missing or has the wrong size.
-            FolderLockedError: another writer has the folder.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -131,10 +126,6 @@ class ParameterStore:
         """The names of the pinned generations."""
         return pin_names(self.folder)
 
-    def version(self, block: BlockName) -> int:
-        """The generation that last wrote `block`."""
-        return self._shard(block).generation
-
     def counts(self, block: BlockName) -> int:
         """The rows of the block's tensor "means"; 0 if it has none."""
         return self._shard(block).rows
@@ -144,7 +135,7 @@ class ParameterStore:
         return copy.deepcopy(self._shard(block).meta)
 
     def load(
-        self, block: BlockName, names: Iterable[str] | None = None
+        self, block: BlockName, names: Sequence[str] | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The tensors of a block, on the CPU and owning their memory, and its JSON.
 
@@ -154,10 +145,9 @@ class ParameterStore:
                 this object.
 
         Raises:
-            KeyError: no such block or tensor.
-            StoreError: the shard is missing, unreadable or altered.
+            KeyError: no such block.
         """
-        tensors, shard = self._read(block, None if names is None else list(names))
+        tensors, shard = self._read(block, names)
         return tensors, copy.deepcopy(shard.meta)
 
     def commit(
@@ -172,23 +162,14 @@ class ParameterStore:
         shards are written one after another. None keeps the present header or state.
 
         Raises:
-            StoreError: read-only store, too little space (found before anything is written), or a write
-                that failed: the previous generation is intact and the new files are gone, unless the disk
-                refuses even to put the old manifest back; `generation` tells.
-            TypeError, ValueError: something is not JSON, or a block's number is negative.
+            StoreError: too little space, which is found before anything is written, or a write that failed:
+                the new files are gone, unless the disk refuses even to put the old manifest back;
+                `generation` tells.
+            TypeError, ValueError: something is not JSON.
         """
         self._require_writable()
-        for block in updates:
-            if isinstance(block, int) and block < 0:
-                raise ValueError(f"A block's number must not be negative; got {block}.")
         old = self._manifest
         generation = old.generation + 1
-        new = replace(
-            old,
-            generation=generation,
-            header=old.header if header is None else header,
-            state=old.state if state is None else state,
-        )
         with self._or_roll_back(f"Writing generation {generation} failed"):
             self._require_space(sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values()))
             shards = {
@@ -197,8 +178,9 @@ class ParameterStore:
             }
             fsync_folder(self.folder)
             crash_points.reached(crash_points.SHARDS_IN_PLACE)
-            new = replace(new, blocks=old.blocks | shards)
-            self._publish(new)
+            header = old.header if header is None else header
+            state = old.state if state is None else state
+            self._publish(Manifest(generation, header, state, old.blocks | shards))
         self._verified.update(shard.file for shard in shards.values())
         self._collect()
         return generation
@@ -207,7 +189,6 @@ class ParameterStore:
         """Keep the present generation under `name`, in place of what had this name, until `unpin`.
 
         Raises:
-            StoreError: read-only store, or the disk refused.
             ValueError: the name has other characters than letters, digits, '_', '-' and '.'.
         """
         self._require_writable()
@@ -219,11 +200,7 @@ class ParameterStore:
         self._collect()
 
     def unpin(self, name: str) -> None:
-        """Let the generation pinned under `name` go.
-
-        Raises:
-            StoreError: read-only store, no such pin, or the disk refused.
-        """
+        """Let the generation pinned under `name` go."""
         self._require_writable()
         path = manifest_path(self.folder, name)
         try:
@@ -238,9 +215,6 @@ class ParameterStore:
 
         Blocks keep the versions they were pinned with. The number still grows, so that no version is ever
         given to two different contents, and no block of the abandoned generations looks fresh.
-
-        Raises:
-            StoreError: read-only store, no such pin, or a write that failed.
         """
         self._require_writable()
         pinned = read_checked_manifest(manifest_path(self.folder, name))
@@ -254,10 +228,6 @@ class ParameterStore:
 
         Shards are shared by hard links where the file system can, which costs no space, and copied
         elsewhere. Shards are never written in place, so neither store changes the other.
-
-        Raises:
-            StoreError: `folder` holds a store already, or the disk refused.
-            FolderLockedError: another writer has it.
         """
         folder = Path(folder)
         manifest = self._manifest
@@ -286,7 +256,7 @@ class ParameterStore:
         except KeyError:
             raise KeyError(f"{self.folder} has no block {block}; it has {self.blocks}.") from None
 
-    def _read(self, block: BlockName, names: list[str] | None) -> tuple[dict[str, Tensor], Shard]:
+    def _read(self, block: BlockName, names: Sequence[str] | None) -> tuple[dict[str, Tensor], Shard]:
         while True:
             shard = self._shard(block)
             path = self.folder / shard.file
@@ -372,12 +342,7 @@ class ParameterStore:
 
 
 def _claim(folder: Path) -> FolderLock:
-    """Make `folder` if need be, and take its lock, for a new store in it.
-
-    Raises:
-        StoreError: it holds a store already, or cannot be written to.
-        FolderLockedError: another writer has it.
-    """
+    """Make `folder` if need be, and take its lock, for a new store in it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FolderLock(folder)

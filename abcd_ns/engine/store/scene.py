@@ -194,19 +194,11 @@ class StoredScene(VisitScene):
         return 0 < within <= time.monotonic() - self._rested
 
     def flush(self) -> None:
-        """Return when all that was put to rest is durable; what failed before is tried again.
-
-        Raises:
-            StoreError: the disk refused; nothing is lost as long as the process lives.
-        """
+        """Return when all that was put to rest is durable; what failed before is tried again. See `rest`."""
         self._writer.flush()
 
     def close(self) -> None:
-        """Write what waits, and let go of the store. Harmless when done twice.
-
-        Raises:
-            StoreError: the disk refused.
-        """
+        """Write what waits, and let go of the store. Harmless when done twice."""
         try:
             self.flush()
         finally:
@@ -279,7 +271,7 @@ class StoredScene(VisitScene):
 
     def gaussians(self, block: int) -> Gaussians:
         if not self._is_live(block):
-            return self._seen_at_rest(block, "cpu", None)
+            return self.drawn(block, "cpu")
         live = self._live[1]().detach()
         return live[self.tree.assign(live.means) == block] if self.is_live_as_a_whole else live
 
@@ -287,16 +279,6 @@ class StoredScene(VisitScene):
         """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
         if self._is_live(block):
             return super().drawn(block, device, which)
-        return self._seen_at_rest(block, device, which)
-
-    def everything(self, device: torch.device | str) -> Gaussians:
-        """All blocks, one after the other."""
-        if self.is_live_as_a_whole:  # who lives where is asked once
-            live = self._live[1]().detach()
-            return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
-        return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
-
-    def _seen_at_rest(self, block: int, device: torch.device | str, which: Which | None) -> Gaussians:
         packed, migrants = self._packed(block, whole=False), self.pending_for(block)
         rows = ~packed.tensors[IS_DEFERRED]  # they are not to be seen before the block's next visit
         if which is not None:
@@ -305,6 +287,13 @@ class StoredScene(VisitScene):
         if migrants is None:
             return found
         return Gaussians.cat([found, _picked(migrants.gaussians, which).to(device)])
+
+    def everything(self, device: torch.device | str) -> Gaussians:
+        """All blocks, one after the other."""
+        if self.is_live_as_a_whole:  # who lives where is asked once
+            live = self._live[1]().detach()
+            return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
+        return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         stored, migrants = self.stored(block), self.pending_for(block)
@@ -338,12 +327,9 @@ class StoredScene(VisitScene):
     def parameters(self) -> int:
         """Of how many numbers all Gaussians are, what is live included; harmonics count up to the degree of
         each."""
-        counted, live = 0, None
-        if self._live is not None:
-            live, alive = self._live
-            counted = count_parameters(alive().features_rest.detach())
-        for block in range(self.tree.num_blocks) if not self.is_live_as_a_whole else ():
-            if block != live:
+        counted = 0 if self._live is None else count_parameters(self._live[1]().features_rest.detach())
+        for block in range(self.tree.num_blocks):
+            if not self._is_live(block):
                 migrants = self.pending_for(block)
                 counted += self._meta(block)["parameters"]
                 counted += 0 if migrants is None else count_parameters(migrants.gaussians.features_rest)

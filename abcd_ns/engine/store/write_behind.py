@@ -75,11 +75,7 @@ class WriteBehind:
             self._wake()
 
     def check(self) -> None:
-        """See that the last write went well.
-
-        Raises:
-            StoreError: it did not. Nothing of it is lost: it waits for the next.
-        """
+        """Raise the error of the last write, if it failed. Nothing of it is lost: it waits for the next."""
         with self.lock:
             error, self._error = self._error, None
             if error is not None:
@@ -94,26 +90,24 @@ class WriteBehind:
     def begin(self) -> None:
         """Return when all that waits is being written, or could not be."""
         with self.lock:
-            if self._waiting is not None:
-                self._due = -math.inf
-                self._wake()
+            self._hurry()
             while self._error is None and self._waiting is not None:
                 self.lock.wait()
 
     def flush(self) -> None:
-        """Write all that waits, and return when it is durable; what failed before is tried again.
-
-        Raises:
-            StoreError: the disk refused; all that waited still does.
-        """
+        """Write all that waits, and return when it is durable; what failed before is tried again. Raises as
+        `check`."""
         with self.lock:
             self._error = None
-            if self._waiting is not None:
-                self._due = -math.inf
-                self._wake()
+            self._hurry()
             while self._error is None and (self._waiting is not None or self._busy):
                 self.lock.wait()
             self.check()
+
+    def _hurry(self) -> None:
+        if self._waiting is not None:
+            self._due = -math.inf
+            self._wake()
 
     def _wake(self) -> None:
         if self._thread is None:

@@ -9,7 +9,6 @@ from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
-from abcd_ns.engine.store.commit import has_coarse_model
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -98,7 +97,7 @@ class Planner(Visits):
         """
         run, state = self._run, self._run.state
         began = run.stopwatch.seconds
-        if state.visit == 0 and has_coarse_model(self._scene) and run.progress < self._config.warmup:
+        if state.visit == 0 and self._scene.has(DEFERRED) and run.progress < self._config.warmup:
             state.active = self._warm_up(run.sh_degree, began)
         else:
             state.active = self._next_visit(state, run.sh_degree, began, at_once)

@@ -7,10 +7,8 @@ import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import Clocks
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, blocks_at_rest
-from abcd_ns.engine.store.special_blocks import DEFERRED, in_order
-from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY
+from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
 from tests.reference.scenes import STILL, assert_resumes, listen, whole_scene
@@ -24,25 +22,6 @@ LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 def warm_up_is_not_prolonged(monkeypatch):
     """Its share of the run is known beforehand then."""
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 1)
-
-
-def test_without_a_coarse_model_nothing_waits(start):
-    tree = build_kd(start.means, 4)
-    assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
-    assert in_order(blocks_at_rest(tree, start, room=30)) == [0, 1, 2, 3, DEFERRED]
-
-
-def test_where_all_fit_all_are_the_coarse_model_and_nobody_waits(make, photos, start):
-    coordinator = make(blocks=4, steps=40, coarse_model=1000, warmup=0.25, density=STILL)
-    train(coordinator, photos, steps=3)
-    assert coordinator.state.active.is_whole
-    assert len(coordinator.params["means"]) == len(start)
-    train(coordinator, photos, steps=7)
-    assert coordinator.state.active is None
-    assert len(whole_scene(coordinator)) == coordinator.count() == len(start)
-    assert [coordinator.scene.count(block) for block in range(4)] == pytest.approx([30] * 4, abs=2)
-    train(coordinator, photos)
-    assert coordinator.finished
 
 
 def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, photos):
@@ -107,20 +86,6 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
     assert_resumes(make, photos, 4, 10, 13, blocks=4, steps=24, coarse_model=30, warmup=0.4)
 
 
-def test_density_controls_clock_is_the_runs(make, photos, monkeypatch):
-    """It does not start anew when the warm-up is over, which grows as well."""
-    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.5, density=STILL)
-    found = []
-
-    def watch(_control, _params, _optimizers, growth, _infos, _judged, clock):
-        found.append(clock.progress)
-        return growth
-
-    monkeypatch.setattr(DensityControl, "after_step", watch)
-    train(coordinator, photos)
-    assert found == pytest.approx([(step + 1) / 40 for step in range(40)])
-
-
 @pytest.mark.parametrize("most", [0, 125, 400])
 def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
@@ -145,7 +110,6 @@ def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
 @pytest.mark.parametrize(
     ("coarse_model", "warmup", "longer", "passes", "expected"),
     [
-        (30, 0.5, 1, 1, 5),
         (30, 0.5, 1, 2, 10),
         (30, 0.5, 1, 24, 25),
         (120, 0.2, 2, 1, 10),

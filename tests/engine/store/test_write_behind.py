@@ -22,7 +22,7 @@ from abcd_ns.engine.store.special_blocks import LIVE, PENDING
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.engine.store.disks import PATIENCE, Disk, on_disk, wait_until
-from tests.reference.scenes import STILL, equal, listen, random_gaussians, stop, whole_scene
+from tests.reference.scenes import STILL, equal, listen, random_gaussians, stop
 
 SOON = 1e-6
 """Seconds."""
@@ -131,14 +131,6 @@ def test_a_large_live_block_is_written_beside_the_training_and_a_second_one_wait
     assert disk.commits == [({LIVE}, {"step": 1}), ({LIVE}, {"step": 2})]
 
 
-def test_with_no_seconds_to_wait_all_is_durable_at_once_and_the_thread_ends(scene):
-    rest(scene, 1, 0)
-    assert scene._writer._thread.is_alive()
-    rest(scene, 2, 1, within=0.0)
-    assert on_disk(scene) == {"step": 2}
-    wait_until(lambda: scene._writer._thread is None)
-
-
 # Errors
 
 
@@ -173,23 +165,6 @@ def test_a_write_that_failed_is_told_once_and_made_good_by_the_next(scene, disk)
 def same(a: BlockState, b: BlockState) -> bool:
     (first, meta), (second, other) = a.packed(), b.packed()
     return meta == other and all(torch.equal(value, second[name]) for name, value in first.items())
-
-
-def test_a_run_hears_of_a_full_disk_and_can_be_saved_when_there_is_room(make, photos):
-    coordinator = make(blocks=3, steps=60, commit_seconds=SOON)
-    disk = Disk(coordinator.scene.store)
-    train(coordinator, photos, steps=2)
-    disk.refuses = True
-    with pytest.raises(StoreError, match="full"):
-        train(coordinator, photos)
-    disk.refuses = False
-    coordinator.save()
-    assert on_disk(coordinator.scene)["step"] == coordinator.state.step > 2
-    expected = whole_scene(coordinator)
-    coordinator.close()
-    again = make(blocks=3, steps=60, resume=True)
-    assert equal(expected, whole_scene(again))
-    train(again, photos)
 
 
 def test_a_fork_waits_for_the_write_and_the_child_can_read(scene, disk):
@@ -251,14 +226,6 @@ def test_what_only_its_own_visit_needs_goes_first(scene):
     memory.shrink()
     assert [memory.drawn(number) is None for number in range(4)] == [False, True, False, False]
     assert memory.nbytes == sum(rests[number].nbytes for number in (0, 2, 3))
-
-
-def test_what_is_not_on_disk_is_never_let_go(scene, disk):
-    small = StoredScene(scene.tree, scene.store, ram_bytes=1)
-    disk.refuses = True
-    with pytest.raises(StoreError):
-        rest(small, 1, *range(4), within=0.0)
-    assert [len(small.state(block)) for block in range(4)] == [9] * 4
 
 
 def test_what_was_written_does_not_stay_while_the_next_waits(scene, disk):
