@@ -122,9 +122,13 @@ def main(args: Sequence[str] | None = None) -> int:
     except UserError as error:
         message = str(error)
     except OSError as error:
-        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        if error.filename is None and not is_full:
             raise
-        message = f"{error.filename or 'What it writes'} cannot be used: {error.strerror}."
+        message = (
+            f"{error.filename or 'The output'} cannot be {'written' if is_full else 'used'}: {error.strerror}"
+        )
+        message += "; free some space." if is_full else "."
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     from rich.console import Console  # `abcd --help` has no use for it

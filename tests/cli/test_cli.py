@@ -86,7 +86,11 @@ def test_arguments_reach_the_function_which_sets_the_exit_code(greet, capsys):
     [
         ("absent", 2, "error: absent: no such scene; give an existing folder.\n"),
         ("locked", 2, "error: run/log.jsonl cannot be used: Permission denied.\n"),
-        ("full", 2, "error: What it writes cannot be used: No space left on device.\n"),
+        (
+            "full",
+            2,
+            "error: The output cannot be written: No space left on device; free some space.\n",
+        ),
         ("ctrl-c", 130, ""),
     ],
 )
