@@ -125,12 +125,15 @@ class AbcdPipeline(VanillaPipeline):
             outputs, losses, metrics = super().get_train_loss_dict(step)
             self._drawn.append(outputs.pop("rendered").kept)
             self._errors += outputs.pop("errors")
+            share = outputs["batch"].share  # which the coordinator's own loss has by now
+            losses = {k: loss if k == "main_loss" else share * loss for k, loss in losses.items()}
             if not self.datamanager.is_within_step:
                 metrics["psnr"] = -10 * torch.stack(self._errors).log10().mean()
-                return outputs, {"main_loss": losses["main_loss"] + earlier}, metrics
-            losses["main_loss"].backward()
-            earlier = earlier + losses["main_loss"].detach()
-            del outputs, losses  # before more is drawn
+                return outputs, losses | {"main_loss": losses["main_loss"] + earlier}, metrics
+            loss = sum(losses.values())
+            loss.backward()
+            earlier = earlier + loss.detach()
+            del outputs, losses, loss  # before more is drawn
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
