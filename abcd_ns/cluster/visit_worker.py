@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 
 from abcd_ns.cluster.assignment import VisitOutcome, VisitTask
@@ -25,7 +24,7 @@ from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
-from abcd_ns.engine.train.training_loop import step_by
+from abcd_ns.engine.train.training_loop import Judgement, take_step
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View
 
@@ -152,22 +151,13 @@ class VisitWorker:
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
-        drawn, errors = [], []
-
-        def loss_of(part: Batch) -> Tensor:
-            targets = [self._target(sample) for sample in part.samples]
-            rendered, rows = training.render(part), []
-            drawn.append(rendered.kept)
-            for sample, picture, (photo, counts) in zip(
-                part.samples, rendered.pictures, targets, strict=True
-            ):
-                found = (picture, photo, shared.target(sample, photo))
-                rows.append(
-                    found if counts is None else [pixels * counts.to(picture.device) for pixels in found]
-                )
+        def judge(part: Batch, rendered: Rendered) -> Judgement:
+            rows = []
+            for sample, picture in zip(part.samples, rendered.pictures, strict=True):
+                photo, counts = self._target(sample)
+                found = picture, photo, shared.target(sample, photo)
+                rows.append(found if counts is None else [each * counts.to(picture.device) for each in found])
             pictures, photos, wanted = map(list, zip(*rows, strict=True))
-            errors.extend(squared_errors(pictures, photos))
-            return training.loss(part, pictures, wanted)
+            return training.loss(part, pictures, wanted), squared_errors(pictures, photos)
 
-        step_by(map(loss_of, training.next_batch().parts()), training.run.optimizers)
-        training.after_step(Rendered.joined(drawn), errors)
+        take_step(training, training.run.optimizers, judge)

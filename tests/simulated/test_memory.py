@@ -78,18 +78,24 @@ def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given, batch):
     assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)
 
 
+def peak_of_layers(counts, coordinator) -> int:
+    """Live bytes at most while the layers of a visit's first view are drawn, beside what was there."""
+    layers, view = coordinator.visit.layers, coordinator.state.active.geometry.views[0]
+    layers._store = LayerStore(DEVICE, 1 << 30)
+    held = counts.live_bytes
+    counts.reset_peak()
+    list(layers.draw([view]))
+    return counts.peak_bytes - held
+
+
 def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat):
     peaks, blocks = [], 8
     for width in (48, 96):
         options = {"gaussians": 60, "width": width, "size": 0.2, "blocks": blocks, "pass_gaussians": 1}
         coordinator, _ = run_on(tmp_path / str(width), **options)
-        layers, view = coordinator.visit.layers, coordinator.state.active.geometry.views[0]
-        layers._store = LayerStore(DEVICE, 1 << 30)
-        held = simulated_gsplat.live_bytes
-        simulated_gsplat.reset_peak()
-        list(layers.draw([view]))
-        pixels = coordinator.state.active.geometry.crops[view].pixels
-        peaks.append((pixels, simulated_gsplat.peak_bytes - held))
+        geometry = coordinator.state.active.geometry
+        pixels = geometry.crops[geometry.views[0]].pixels
+        peaks.append((pixels, peak_of_layers(simulated_gsplat, coordinator)))
     (few, small), (many, large) = peaks
     huge = 1 << 26  # so that no least amount counts
     one, two = (DeviceNeeds(n * huge, 1, levels=levels_of(blocks)).drawing_bytes for n in (1, 2))
@@ -103,13 +109,8 @@ def test_what_a_frozen_gaussian_takes_while_layers_are_drawn(tmp_path, simulated
     for gaussians in (800, 1600):
         options = {"gaussians": gaussians, "width": 32, "blocks": 4, "density": STILL}
         coordinator, _ = run_on(tmp_path / str(gaussians), **options)
-        layers, view = coordinator.visit.layers, coordinator.state.active.geometry.views[0]
-        layers._store = LayerStore(DEVICE, 1 << 30)
-        held = simulated_gsplat.live_bytes
-        simulated_gsplat.reset_peak()
-        list(layers.draw([view]))
         frozen = coordinator.count() - len(coordinator.params["means"])
-        peaks.append((frozen, simulated_gsplat.peak_bytes - held))
+        peaks.append((frozen, peak_of_layers(simulated_gsplat, coordinator)))
     (few, small), (many, large) = peaks
     slope = (large - small) / (many - few)
     assert slope <= drawing_bytes(3, "3dgs") <= LAVISH_GAUSSIAN * slope

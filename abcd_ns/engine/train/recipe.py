@@ -72,7 +72,7 @@ class Limits:
     """The same for a block that is the whole scene: it has no neighbours, and draws one view in a step, so
     there is room for more. 0 takes `block_limit`."""
     batch_limit: int = 0
-    """Views of a step that are drawn at once, at most; the others follow. It changes no result."""
+    """Views of a step that are drawn at once, at most; the others follow. Results agree to rounding."""
     crop_pixels: int = 0
     """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
     another one each time, and weighs it by how much of the crop it leaves out."""

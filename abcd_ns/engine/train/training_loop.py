@@ -1,6 +1,6 @@
 """The plainest caller of a trainer: for tests, benchmarks, and anyone without nerfstudio."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,8 +9,11 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers
 from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Crop
 
+Judgement = tuple[Float[Tensor, ""], Sequence[Float[Tensor, ""]]]
+"""A part's loss, and the mean squared error of each of its pictures."""
 PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
 """Gives the pixels of a crop of a view's photo, 0..1, by the view's index."""
 
@@ -30,27 +33,35 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     if coordinator.trains_elsewhere:
         coordinator.await_step()
         return
-    drawn, errors = [], []
 
-    def loss_of(part: Batch) -> Tensor:
+    def judge(part: Batch, rendered: Rendered) -> Judgement:
         read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in part.samples)
         photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
-        rendered = coordinator.render(part)
-        drawn.append(rendered.kept)
-        errors.extend(squared_errors(rendered.pictures, photos))
-        return coordinator.loss(part, rendered.pictures, photos)
+        errors = squared_errors(rendered.pictures, photos)
+        return coordinator.loss(part, rendered.pictures, photos), errors
 
-    step_by(map(loss_of, coordinator.next_batch().parts()), coordinator.optimizers)
-    coordinator.after_step(Rendered.joined(drawn), errors)
+    take_step(coordinator, coordinator.optimizers, judge)
 
 
-def step_by(losses: Iterable[Float[Tensor, ""]], optimizers: Optimizers) -> None:
-    """Take the gradients of a step's losses, one after the other, and step every optimizer."""
+def take_step(
+    training: Trainer | VisitTraining, optimizers: Optimizers, judge: Callable[[Batch, Rendered], Judgement]
+) -> None:
+    """Draw a step's parts and take the gradients of their losses, one after the other; step every optimizer.
+
+    Args:
+        judge: of a part, and of what was drawn of it.
+    """
+    batch, drawn, errors = training.next_batch(), [], []
     for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)
-    for loss in losses:
+    for part in batch.parts():
+        rendered = training.render(part)
+        loss, found = judge(part, rendered)
+        drawn.append(rendered.kept)
+        errors.extend(found)
         if loss.requires_grad:
             loss.backward()
-        del loss  # before more is drawn
+        del rendered, loss  # before more is drawn
     for optimizer in optimizers.values():
         optimizer.step()
+    training.after_step(Rendered.joined(drawn), errors)
