@@ -64,7 +64,8 @@ class OnAssignment(Visits):
         """What the block's limit, and its part of the scene's, leave."""
         config, live = self._run.config, len(self._run.params["means"])
         left = 0 if self._task.allowance is None else self._task.allowance - (live - self._begun)
-        return config.room((config.density.limit or 0) - left, live, self._task.tree.num_blocks)
+        limit = self._run.limits.of_block(self._task.tree.num_blocks)
+        return config.room((config.density.limit or 0) - left, live, limit)
 
 
 class VisitWorker:

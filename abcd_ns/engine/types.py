@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 
@@ -72,9 +73,16 @@ class Gaussians:
         """Cut from any autograd graph; shares memory."""
         return Gaussians(**{name: value.detach() for name, value in self.items()})
 
+    def of_degree(self, sh_degree: int) -> "Gaussians":
+        """With spherical harmonics up to this degree: those above go, those that are missing are 0."""
+        more = (sh_degree + 1) ** 2 - 1 - self.features_rest.shape[1]
+        return self if more == 0 else replace(self, features_rest=F.pad(self.features_rest, (0, 0, 0, more)))
+
     @staticmethod
     def cat(parts: Sequence["Gaussians"]) -> "Gaussians":
-        """All parts in one list, in order. `parts` must not be empty."""
+        """All parts in one list, in order, with as many harmonics as any has. `parts` must not be empty."""
+        highest = max(part.sh_degree for part in parts)
+        parts = [part.of_degree(highest) for part in parts]
         return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in PARAM_NAMES})
 
     @staticmethod

@@ -12,7 +12,14 @@ from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
+from abcd_ns.engine.train.memory import (
+    GROWING_DEGREE,
+    PHOTO_SHARE,
+    DeviceNeeds,
+    fewest_blocks,
+    free_on_gpu,
+    levels_of,
+)
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
@@ -38,7 +45,7 @@ PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
-FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians")
+FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
 """The limits that follow from the device's memory; a run keeps them."""
 COARSE_MODEL = "scaffold_gaussians"
 """Another, of the warm-up's memory."""
@@ -69,6 +76,8 @@ class Fit:
     """Views that are drawn at once, at most; 0 is no limit."""
     pass_gaussians: int = 0
     """Frozen Gaussians that are drawn at once, at most; 0 is as many as usual."""
+    late_harmonics: int = 0
+    """See Limits."""
 
     @property
     def blocks_at_the_end(self) -> int:
@@ -80,7 +89,7 @@ class Fit:
     @property
     def limits(self) -> dict[str, int]:
         """What of it a run keeps to: FITTED, by name."""
-        values = (self.limit, self.sole, self.batch, self.crop_pixels, self.pass_gaussians)
+        values = self.limit, self.sole, self.batch, self.crop_pixels, self.pass_gaussians, self.late_harmonics
         return dict(zip(FITTED, values, strict=True))
 
     def in_words(self) -> str:
@@ -121,6 +130,8 @@ class Demand:
     """That there are already."""
     on_cpu: bool = False
     """Whether the CPU is the device: then layers and photos are kept under another budget."""
+    late_harmonics: int = 0
+    """See Limits."""
 
     @property
     def first(self) -> int:
@@ -146,7 +157,14 @@ class Demand:
         training, views = self.training, views_per_step(self.training.batch, blocks)
         at_once = min(views, self.at_once)
         options = (training.sh_degree, crop_pixels, levels, not self.on_cpu, training.primitive)
-        return DeviceNeeds(self.pixels, at_once, *options, views - at_once)
+        degree = min(GROWING_DEGREE, training.sh_degree) if self.late_harmonics else None
+        return DeviceNeeds(self.pixels, at_once, *options, views - at_once, degree)
+
+    def most_beside(self, limit: int) -> int:
+        """Frozen Gaussians that a pass may draw beside a block at its limit. The least room for them is where
+        it has all its harmonics, and so fewer Gaussians."""
+        needs, whole = (replace(self, late_harmonics=n).needs(2, 0, 0) for n in (self.late_harmonics, 0))
+        return whole.frozen_beside(limit * needs.gaussian_bytes // whole.gaussian_bytes)
 
 
 def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = BUDGET_FLAG) -> Fit:
@@ -161,6 +179,10 @@ def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory:
         UserError: the budget has no room for any block worth a visit; says what would help.
     """
     fit = _fit(budget, demand)
+    if fit is not None and fit.blocks == 1:
+        return fit
+    demand = replace(demand, late_harmonics=1)
+    fit = _fit(budget, demand)
     if fit is None:
         raise UserError(_refusal(budget, demand, downscale, memory))
     return fit
@@ -172,6 +194,11 @@ def fit_gaussians(room: int, demand: Demand) -> Fit:
     Raises:
         UserError: they would have next to none.
     """
+    whole = _fit_gaussians(room, demand)
+    return whole if whole.blocks == 1 else _fit_gaussians(room, replace(demand, late_harmonics=1))
+
+
+def _fit_gaussians(room: int, demand: Demand) -> Fit:
     training = demand.training
     sole, limit = (room // demand.needs(blocks, 0, levels=0).gaussian_bytes for blocks in (1, 2))
     if limit < LEAST_LIMIT:
@@ -179,8 +206,8 @@ def fit_gaussians(room: int, demand: Demand) -> Fit:
     blocks, overlap = _fewest(demand.first, limit, sole), training.recipe.overlap
     if overlap > 0:  # an isolated block begins with what lies around its cell, too, and is never cut
         blocks, limit, sole = _fewest(math.ceil((1 + 2 * overlap) ** 2 * demand.first), limit, 0), 0, limit
-    most = demand.needs(2, 0, levels=0).frozen_beside(limit or sole)
-    return Fit(blocks, limit, sole, room, demand.gaussians, 0, demand.at_once, most)
+    most = demand.most_beside(limit or sole)
+    return Fit(blocks, limit, sole, room, demand.gaussians, 0, demand.at_once, most, demand.late_harmonics)
 
 
 def _fit(budget: int, demand: Demand) -> Fit | None:
@@ -199,8 +226,9 @@ def _fit(budget: int, demand: Demand) -> Fit | None:
     if not limit and not fits_in_one:
         return None
     blocks = 1 if fits_in_one else _fewest(demand.first, limit, 0)
-    most = max(demand.needs(2, crop, levels).frozen_beside(limit), LEAST_PASS)
-    return Fit(blocks, limit, max(sole, 0), budget, demand.gaussians, crop, demand.at_once, most)
+    most = max(demand.most_beside(limit), LEAST_PASS)
+    found = blocks, limit, max(sole, 0), budget, demand.gaussians, crop, demand.at_once, most
+    return Fit(*found, demand.late_harmonics)
 
 
 def _crop(budget: int, demand: Demand) -> int:

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, levels_of
+from abcd_ns.engine.train.memory import (
+    GROWING_DEGREE,
+    DeviceNeeds,
+    coarse_model_size,
+    degree_with_room,
+    levels_of,
+    limits_at,
+)
 from abcd_ns.errors import UserError
 from abcd_ns.run.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
@@ -31,8 +38,9 @@ def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = Non
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
-    waiting = 0 if blocks == 1 else 3
-    return DeviceNeeds(pixels, 1, crop_pixels=fit.crop_pixels, levels=levels_of(blocks), waiting=waiting)
+    waiting, degree = 0 if blocks == 1 else 3, GROWING_DEGREE if fit.late_harmonics else None
+    options = {"crop_pixels": fit.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
+    return DeviceNeeds(pixels, 1, **options, live_degree=degree)
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
@@ -100,6 +108,24 @@ def test_layers_that_are_folded_take_no_more_than_the_steps_that_follow(side, ba
     needs = DeviceNeeds(side**2, batch)
     beside = needs.drawing_bytes - max(PARTS_BYTES, needs.levels * BYTES_PER_PIXEL * needs.pixels)
     assert PARTS_BYTES <= needs.parts_bytes <= max(needs.fixed_bytes - beside, PARTS_BYTES)
+
+
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
+    fit = fit_for(8, PIXELS, 30_000_000)
+    training = training_config(**fit.limits)
+    growing, most = needs_of(fit, PIXELS, blocks), training.limits.of_block(blocks)
+    for degree in range(GROWING_DEGREE + 1, 4):
+        few = limits_at(training, degree).of_block(blocks)
+        needs = dataclasses.replace(growing, live_degree=degree)
+        assert needs.bytes_for(few) <= growing.bytes_for(most) < needs.bytes_for(few + 2)
+        assert degree_with_room(training, int(FULL * few), blocks, FULL) == degree
+        assert degree_with_room(training, int(FULL * few) + 1, blocks, FULL) == degree - 1
+
+
+def test_harmonics_come_late_only_where_memory_cuts_a_scene():
+    assert fit_for(8, PIXELS, 10_000).late_harmonics == 0
+    assert fit_for(8, PIXELS, 30_000_000).late_harmonics == 1
 
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():

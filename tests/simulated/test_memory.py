@@ -6,14 +6,16 @@ kernels take inside, and what an allocator cannot use, is not seen here.
 """
 
 import gc
+from dataclasses import replace
 
 import pytest
+import torch
 
 from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import GROWING_DEGREE, DeviceNeeds, drawing_bytes, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
@@ -28,6 +30,8 @@ def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, primitive:
     views = ring_of_views(4, width=width, height=width)
     photos = Photos(random_gaussians(30, seed=7, size=0.12), views)
     start = random_gaussians(gaussians, seed=1, size=size, sh_degree=3)
+    if "late_harmonics" in options:
+        start = replace(start, features_rest=torch.zeros_like(start.features_rest))
     draws = GsplatRasterizer(primitive)
     options = {"steps": 40, "primitive": primitive, **options}
     coordinator = make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
@@ -63,18 +67,23 @@ def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, given):
     assert large - small <= model[1] - model[0] <= LAVISH * (large - small)
 
 
+LATE = {"density": GROWING, "late_harmonics": 1}
 GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
 
 
 @pytest.mark.parametrize("batch", [1, 4])
-@pytest.mark.parametrize("given", [{"density": GROWING}, GROWING_SURFELS])
+@pytest.mark.parametrize(
+    "given", [{"density": GROWING}, GROWING_SURFELS, {"density": GROWING, "late_harmonics": 1}]
+)
 def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given, batch):
     options = {"width": 32, "batch": batch, **given}
     (small, few), (large, many) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
     primitive = given.get("primitive", "3dgs")
-    model = DeviceNeeds(32**2, batch, levels=0, primitive=primitive).gaussian_bytes * (many - few)
+    degree = GROWING_DEGREE if "late_harmonics" in given else None
+    needs = DeviceNeeds(32**2, batch, levels=0, primitive=primitive, live_degree=degree)
+    model = needs.gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)
 
 

@@ -83,6 +83,11 @@ class BlockState:
         """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
         return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_views=0))
 
+    def of_degree(self, sh_degree: int) -> "BlockState":
+        """See `Gaussians.of_degree`."""
+        moments = {name: getattr(self, name).of_degree(sh_degree) for name in MOMENTS}
+        return replace(self, gaussians=self.gaussians.of_degree(sh_degree), **moments)
+
     def to(self, device: torch.device | str) -> "BlockState":
         """On another device."""
         return self._each(lambda part: part.to(device))

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, MutableMapping
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
@@ -55,6 +56,21 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
             **{moment: getattr(getattr(state, moment), name).clone() for moment in MOMENTS},
         }
         params[name] = parameter
+
+
+def raise_degree(params: Params, optimizers: Optimizers, sh_degree: int) -> None:
+    """Give the live block room for spherical harmonics of this degree, which begin as zeros; none go."""
+    name = "features_rest"
+    before, more = params[name], (sh_degree + 1) ** 2 - 1 - params[name].shape[1]
+    if more <= 0:
+        return
+    after = Parameter(F.pad(before.detach(), (0, 0, 0, more)))
+    adam = optimizers[name].state.pop(before)
+    adam |= {moment: F.pad(adam[moment], (0, 0, 0, more)) for moment in MOMENTS}
+    adam["step"] = optimizers["means"].state[params["means"]]["step"].clone()  # it skips what is empty
+    optimizers[name].param_groups[0]["params"] = [after]
+    optimizers[name].state[after] = adam
+    params[name] = after
 
 
 def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:

@@ -58,10 +58,12 @@ class TrainingConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
-    def room(self, scene: int, block: int, blocks: int) -> int | None:
-        """Gaussians that may be added to a block of so many in a scene of so many and of so many blocks; None
-        for any number."""
-        limit = self.limits.of_block(blocks)
+    def room(self, scene: int, block: int, limit: int) -> int | None:
+        """Gaussians that may be added to a block of so many in a scene of so many; None for any number.
+
+        Args:
+            limit: of the block; 0 for none.
+        """
         rooms = [] if self.density.limit is None else [self.density.limit - scene]
         rooms += [limit - block] if limit else []
         return min(rooms, default=None)

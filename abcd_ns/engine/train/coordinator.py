@@ -213,7 +213,7 @@ def rest_after_visit(
         updates: what comes to rest of it.
         epoch: that it belongs to.
     """
-    tree, parts = cut_full(run.scene, updates, run.state, run.config.limits, run.announce)
+    tree, parts = cut_full(run.scene, updates, run.state, run.limits, run.announce)
     if active.is_joint and tree.num_blocks > 1:
         run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
     run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)

@@ -6,7 +6,7 @@ takes; what a GPU took is in docs/results/gpu.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import psutil
 import torch
@@ -16,6 +16,7 @@ from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LEAST_PASS, PA
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.units import bytes_in_words
@@ -37,6 +38,8 @@ LAYER_SHARE = 1 / 8
 """Of the device's budget, for the layers of a visit."""
 PHOTO_SHARE = 1 / 8
 """Of the device's budget, for photos that are kept there."""
+GROWING_DEGREE = 0
+"""Of harmonics while blocks grow, where memory cuts a scene: there are fewer Gaussians afterwards."""
 LIVE_COPIES = 5
 """Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
 
@@ -55,6 +58,7 @@ class DeviceNeeds:
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
         primitive: what a Gaussian is.
+        live_degree: of harmonics of a live block; None for `sh_degree`, that of the scene.
     """
 
     pixels: int
@@ -65,11 +69,12 @@ class DeviceNeeds:
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
     waiting: int = 0
+    live_degree: int | None = None
 
     @property
     def parameter_bytes(self) -> int:
-        """Of one Gaussian's parameters."""
-        return parameter_bytes(self.sh_degree)
+        """Of one Gaussian's parameters, while it is live."""
+        return parameter_bytes(self.sh_degree if self.live_degree is None else self.live_degree)
 
     @property
     def gaussian_bytes(self) -> int:
@@ -96,7 +101,9 @@ class DeviceNeeds:
 
     @property
     def _drawn_bytes(self) -> int:
-        frozen = LEAST_PASS * self.parameter_bytes + DEVICE_SPLATS * projected_bytes(self.primitive)
+        frozen = LEAST_PASS * parameter_bytes(self.sh_degree) + DEVICE_SPLATS * projected_bytes(
+            self.primitive
+        )
         return max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
 
     def frozen_beside(self, live: int) -> int:
@@ -149,16 +156,51 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
     return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
 
 
-def needs_of(config: TrainingConfig, pixels: int, blocks: int) -> DeviceNeeds:
-    """What a visit takes in a run on images of so many pixels at most, in one block or several."""
-    return needs_of_step(config, pixels, views_per_step(config.batch, blocks))
+def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | None = None) -> DeviceNeeds:
+    """What a visit takes in a run on images of so many pixels at most, in one block or several.
+
+    Args:
+        sh_degree: of the live block; None for the one that limits count on.
+    """
+    return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
 
-def needs_of_step(config: TrainingConfig, pixels: int, views: int) -> DeviceNeeds:
+def needs_of_step(
+    config: TrainingConfig, pixels: int, views: int, sh_degree: int | None = None
+) -> DeviceNeeds:
     """The same where a step has so many views."""
-    at_once, crop = min(views, config.limits.batch_limit or views), config.limits.crop_pixels
-    options = {"primitive": config.primitive, "waiting": views - at_once}
+    limits = config.limits
+    at_once, crop = min(views, limits.batch_limit or views), limits.crop_pixels
+    if sh_degree is None and limits.late_harmonics:
+        sh_degree = min(GROWING_DEGREE, config.sh_degree)
+    options = {"primitive": config.primitive, "waiting": views - at_once, "live_degree": sh_degree}
     return DeviceNeeds(pixels, at_once, config.sh_degree, crop, **options)
+
+
+def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
+    """The limits of a run whose blocks have come to this degree of spherical harmonics."""
+    limits = config.limits
+    if not limits.late_harmonics or sh_degree <= GROWING_DEGREE:
+        return limits
+    sole, block = (
+        limit
+        * needs_of(config, 0, blocks).gaussian_bytes
+        // needs_of(config, 0, blocks, sh_degree).gaussian_bytes
+        for blocks, limit in ((1, limits.sole_limit), (2, limits.block_limit))
+    )
+    return replace(limits, sole_limit=sole, block_limit=block)
+
+
+def degree_with_room(config: TrainingConfig, largest: int, blocks: int, full: float) -> int:
+    """The highest degree of spherical harmonics for which the largest of so many blocks has room.
+
+    Args:
+        largest: Gaussians.
+        full: share of its limit that a block may fill.
+    """
+    degrees = range(config.sh_degree, GROWING_DEGREE, -1)
+    fits = (d for d in degrees if largest <= full * limits_at(config, d).of_block(blocks))
+    return next(fits, min(GROWING_DEGREE, config.sh_degree))
 
 
 def levels_of(blocks: int) -> int:

@@ -102,6 +102,7 @@ class Planner(Visits):
         else:
             state.active = self._next_visit(state, run.sh_degree, began, at_once)
         state.visit += 1
+        state.sh_degree = max(state.sh_degree, state.active.sh_degree)
         return state.active
 
     def room(self) -> int | None:
@@ -111,7 +112,7 @@ class Planner(Visits):
             deferred, limit = self._scene.rows(DEFERRED), self._config.density.limit
             most = self._config.limits.scaffold_gaussians
             return (most if limit is None else min(most, limit - deferred)) - live
-        return self._config.room(run.count(), live, run.blocks)
+        return self._config.room(run.count(), live, run.limits.of_block(run.blocks))
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the coarse model of all blocks is trained."""

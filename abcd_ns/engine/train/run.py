@@ -17,7 +17,10 @@ from abcd_ns.engine.train.capture.light import HeldLight, Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.health.health import Health
+from abcd_ns.engine.train.memory import GROWING_DEGREE, degree_with_room, limits_at
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
 from abcd_ns.engine.types import View
@@ -111,7 +114,24 @@ class TrainingRun:
         active = self.state.active
         restarts = self.config.recipe.sh_restart and active is not None and not active.is_joint
         share = active.done / active.steps if restarts else self.share
-        return sh_degree_at(share, self.config.recipe.sh_ramp, self.config.sh_degree)
+        return min(sh_degree_at(share, self.config.recipe.sh_ramp, self.config.sh_degree), self._degree_limit)
+
+    @property
+    def _degree_limit(self) -> int:
+        """What limits leave for the degree; it never falls."""
+        config, blocks, found = self.config, self.blocks, GROWING_DEGREE
+        if not config.limits.late_harmonics:
+            return config.sh_degree
+        if self.share >= config.density.refine_stop:
+            alone = self.state.active is not None and self.state.active.is_alone
+            counts = [len(self.params["means"])] if alone else map(self.scene.count, range(blocks))
+            found = degree_with_room(config, max(counts), blocks, FULL)
+        return max(self.state.sh_degree, found)
+
+    @property
+    def limits(self) -> Limits:
+        """What a block may have at the present degree of harmonics."""
+        return limits_at(self.config, self.state.sh_degree)
 
     @property
     def active(self) -> ActiveVisit:

@@ -127,6 +127,8 @@ class RunState:
 
     step: int = 0
     """Optimisation steps taken in the whole scene."""
+    sh_degree: int = 0
+    """Of spherical harmonics, that any block has come to."""
     sweep: int = 0
     visit: int = 0
     """Visits begun so far."""

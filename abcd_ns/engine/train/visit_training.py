@@ -76,7 +76,7 @@ class VisitTraining:
         """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
         found it."""
         run, state = self.run, self.run.state
-        self.live.attach(active, self.batch)
+        self.live.attach(active, self.batch, max(active.sh_degree, self.degree))
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
         self._reach = run.reach(active.trained_on)
         run.scene.set_live(block, self._visits.attached(active, run.params))
@@ -107,6 +107,8 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
         come, too."""
         run = self.run
+        if run.active.is_alone:
+            self.live.raise_degree(self.degree)
         decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
         decays = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)

@@ -143,7 +143,8 @@ class Training:
         """
         coordinator = self.coordinator
         config, live = coordinator.config, len(coordinator.params["means"])
-        needs = needs_of_step(config, 0, coordinator.batch)
+        degree = live_gaussians(coordinator.params).sh_degree
+        needs = needs_of_step(config, 0, coordinator.batch, degree)
         held = live * needs.gaussian_bytes
         if drawing:  # parameters and their moments, and of others so many as one pass draws
             most = config.limits.pass_gaussians or default_pass(coordinator.scene)

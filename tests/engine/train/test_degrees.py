@@ -64,7 +64,7 @@ def test_every_gaussian_gets_what_a_list_of_views_says(price, count, monkeypatch
     monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
     monkeypatch.setattr(degrees, "AT_ONCE", 3 * 16 * 16)  # several parts
     gaussians, views = random_gaussians(20, seed=3, sh_degree=3), ring_of_views(count)
-    found = lowered(gaussians, statistics(20), views)
+    found = lowered(gaussians, statistics(20), views, gaussians.sh_degree)
     for row in range(20):
         degree, expected = slow(gaussians, row, views, 30.0, price)
         assert int(found.gone[row]) == 3 - degree
@@ -76,7 +76,7 @@ def test_what_was_not_looked_at_in_every_view_is_not_judged():
     gaussians, growth = random_gaussians(10, sh_degree=2), statistics(10)
     growth["passes"][4:] = 11 / 12
     growth["weight"][:] = 1e-9
-    found = lowered(gaussians, growth, ring_of_views(12))
+    found = lowered(gaussians, growth, ring_of_views(12), gaussians.sh_degree)
     assert found.gone.tolist() == [2.0] * 4 + [0.0] * 6
     assert torch.equal(found.features_rest[4:], gaussians.features_rest[4:])
     assert torch.equal(found.features_dc[4:], gaussians.features_dc[4:])
@@ -85,7 +85,7 @@ def test_what_was_not_looked_at_in_every_view_is_not_judged():
 def test_what_is_gone_does_not_come_back_by_being_looked_at_again():
     gaussians, views = random_gaussians(30, sh_degree=3), ring_of_views(12)
     growth = {**statistics(30, weight=1e6), GONE: torch.arange(30.0) % 4}
-    found = lowered(gaussians, growth, views)
+    found = lowered(gaussians, growth, views, gaussians.sh_degree)
     assert bool((found.gone >= growth[GONE]).all())
 
 
@@ -93,17 +93,17 @@ def test_numbers_that_are_none_are_left_to_who_repairs_them():
     gaussians = random_gaussians(4, sh_degree=3)
     gaussians.means[1] = math.nan
     gaussians.features_rest[2, 5] = math.inf
-    found = lowered(gaussians, statistics(4, weight=1e-9), ring_of_views(12))
+    found = lowered(gaussians, statistics(4, weight=1e-9), ring_of_views(12), gaussians.sh_degree)
     assert found.gone.tolist() == [3.0, 0.0, 0.0, 3.0]
     assert torch.equal(found.features_rest[1], gaussians.features_rest[1])
 
 
 def test_a_scene_without_harmonics_has_none_to_lose():
     gaussians = random_gaussians(5, sh_degree=0)
-    found = lowered(gaussians, statistics(5), ring_of_views(12))
+    found = lowered(gaussians, statistics(5), ring_of_views(12), gaussians.sh_degree)
     assert torch.equal(found.features_dc, gaussians.features_dc)
     assert found.gone.tolist() == [0.0] * 5
-    assert len(lowered(gaussians[:0], statistics(0), ring_of_views(12)).gone) == 0
+    assert len(lowered(gaussians[:0], statistics(0), ring_of_views(12), gaussians.sh_degree).gone) == 0
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.train.density.control import (
     LEAST_REFINEMENTS,
+    USUAL_REFINEMENTS,
     DensityClock,
     DensityConfig,
     DensityControl,
@@ -29,10 +30,13 @@ def refinements(run: int, views: int, taken: int = 1, **changes) -> list[int]:
     return found[1:]
 
 
-@given(st.integers(1000, 30_000), st.integers(1, 15_000), st.integers(1, 4))
+@given(st.integers(400, 30_000), st.integers(1, 15_000), st.integers(1, 4))
 @settings(max_examples=20, deadline=None)
-def test_every_run_is_refined_about_4_to_150_times(run, views, taken):
-    assert LEAST_REFINEMENTS - 1 <= len(refinements(run, views, taken)) <= 150
+def test_every_run_is_refined_about_4_to_150_times_and_20_where_all_views_were_drawn(run, views, taken):
+    found = refinements(run, views, taken)
+    assert LEAST_REFINEMENTS - 1 <= len(found) <= 150
+    all_views_drawn = (0.5 - 1 / 60) * run / views
+    assert len(found) >= 0.7 * min(USUAL_REFINEMENTS, all_views_drawn) - 1
 
 
 @pytest.mark.parametrize(("run", "views"), [(7000, 147), (7000, 300), (30_000, 700)])

@@ -38,7 +38,9 @@ GATHER, REFINE = 1, 6
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
 LEAST_REFINEMENTS = 4
-"""Of a block in a run of 30,000 steps, however many views show it."""
+"""Of a block in a whole run, however many views show it."""
+USUAL_REFINEMENTS, USUAL_VIEWS = 20, 100
+"""A block that few views show is refined every so many views, and at least so many times in a run."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MCMC_MIN_OPACITY = 0.005
@@ -72,9 +74,9 @@ class DensityConfig:
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
     """Share of the run after which no Gaussian is split. A block in its first visit grows on until 0.7."""
-    refine_every: int = 100
-    """Views drawn to train a block between its refinements; as many as show it if these are more, but no more
-    than a quarter of those drawn while it grows."""
+    refine_every: int = 0
+    """Views drawn to train a block between its refinements. 0: 100, fewer in a short run, which refines it 20
+    times. As many as show it if these are more, but no more than a quarter of those drawn while it grows."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
 
@@ -150,7 +152,8 @@ class DensityControl:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
         growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * clock.pace
-        every = max(self.config.refine_every, min(views, int(growing / LEAST_REFINEMENTS)), 1)
+        usual = self.config.refine_every or min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
+        every = max(usual, min(views, int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
-from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, sh_degree_of, up_to_degree
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, up_to_degree
 from abcd_ns.engine.train.density.pruning import contributions, have_contributions
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
@@ -51,15 +51,20 @@ class Lowered(NamedTuple):
     """Degrees that are gone, those before included."""
 
 
-def are_gone(gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"]) -> Bool[Tensor, "n k 1"]:
-    """Which coefficients are."""
-    coefficients = features_rest.shape[1]
-    return ~up_to_degree(sh_degree_of(coefficients) - gone, coefficients)[..., None]
+def are_gone(
+    gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"], highest: int
+) -> Bool[Tensor, "n k 1"]:
+    """Which coefficients are.
+
+    Args:
+        highest: degree of the scene; that of `features_rest` may be lower.
+    """
+    return ~up_to_degree(highest - gone, features_rest.shape[1])[..., None]
 
 
 @torch.no_grad()
 def lower(
-    params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View]
+    params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
     """Let harmonics of the live block go that do not pay, with their moments; see `lowered`.
 
@@ -69,21 +74,24 @@ def lower(
     if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
-    found = lowered(live_gaussians(params).detach(), growth, views)
+    found = lowered(live_gaussians(params).detach(), growth, views, highest)
     dc.copy_(found.features_dc)
     rest.copy_(found.features_rest)
-    adam, gone = optimizers["features_rest"].state[rest], are_gone(found.gone, rest)
+    adam, gone = optimizers["features_rest"].state[rest], are_gone(found.gone, rest, highest)
     for moment in MOMENTS:
         adam[moment].masked_fill_(gone, 0.0)
     return {**growth, GONE: found.gone}
 
 
-def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View]) -> Lowered:
+def lowered(
+    gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View], highest: int
+) -> Lowered:
     """Gaussians with the degrees that pay. Nobody is judged who was not drawn in all views yet.
 
     Args:
         growth: with BLEND_SUMS.
         views: that the block is trained on.
+        highest: degree of the scene; that of the Gaussians may be lower by now.
     """
     weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
@@ -93,7 +101,7 @@ def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[
     room = max(AT_ONCE, OF_EACH * len(gaussians))
     step = max(room // (coefficients * max(len(chosen), coefficients)), 1)
     parts = [slice(start, start + step) for start in range(0, max(len(gaussians), 1), step)]
-    found = [_lowered(gaussians[rows], weight[rows], gone[rows], cameras) for rows in parts]
+    found = [_lowered(gaussians[rows], weight[rows], gone[rows], cameras, highest) for rows in parts]
     return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
 
 
@@ -110,7 +118,11 @@ def _numbers(view: View) -> Float[Tensor, "28"]:
 
 
 def _lowered(
-    gaussians: Gaussians, weight: Float[Tensor, "n"], gone: Float[Tensor, "n"], cameras: _Cameras
+    gaussians: Gaussians,
+    weight: Float[Tensor, "n"],
+    gone: Float[Tensor, "n"],
+    cameras: _Cameras,
+    highest: int,
 ) -> Lowered:
     """As `lowered`, at once.
 
@@ -118,11 +130,11 @@ def _lowered(
         weight: pixels in all views; NaN for who is not judged, which no comparison finds to be less.
     """
     values = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
-    highest = gaussians.sh_degree
+    most = gaussians.sh_degree
     gram = _gram(gaussians, cameras, values.shape[1])
-    before, least = highest - gone, torch.full_like(weight, torch.inf)
+    before, least = (highest - gone).clamp_max(most), torch.full_like(weight, torch.inf)
     best, degree = values, before
-    for candidate in range(highest + 1):
+    for candidate in range(most + 1):
         kept = (candidate + 1) ** 2
         fitted = _fitted(gram, values, kept)
         change = fitted - values
@@ -131,7 +143,8 @@ def _lowered(
         pays = (cost < least) & (candidate <= before)
         best = torch.where(pays[:, None, None], fitted, best)
         degree, least = torch.where(pays, candidate, degree), torch.where(pays, cost, least)
-    return Lowered(best[:, 0], best[:, 1:], highest - degree)
+    gone = torch.where(degree < most, highest - degree, gone)  # higher ones may still come
+    return Lowered(best[:, 0], best[:, 1:], gone)
 
 
 def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: int) -> Tensor:

@@ -203,7 +203,7 @@ class Health:
         rows = unsound(live).nonzero()[:, 0]
         if len(rows) == 0:
             return
-        sound = self._known(live, rows)
+        sound = self._known(live, rows).of_degree(live.sh_degree)
         for name, value in live.items():
             value[rows] = getattr(sound, name).to(value)
             self._forget_moments(name, rows)

@@ -9,7 +9,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, detach
+from abcd_ns.engine.gaussians.param_swap import attach, detach, raise_degree
+from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
@@ -42,36 +43,50 @@ class ActiveBlock:
     def __len__(self) -> int:
         return len(self._run.params["means"])
 
-    def attach(self, active: ActiveVisit, batch: int) -> None:
+    def attach(self, active: ActiveVisit, batch: int, sh_degree: int) -> None:
         """Make the block of a visit live, as it is at rest.
 
         Args:
             batch: views in a step.
+            sh_degree: of its first one. Higher harmonics take no memory, but where the block has some.
 
         Raises:
             OutOfRoomError: it does not fit on the device.
         """
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
-        check_room(rows_for_visit(*which), run.config.sh_degree, run.device)
-        rest = state_for_visit(*which).to(run.device)
+        check_room(rows_for_visit(*which), sh_degree, run.device)
+        rest = state_for_visit(*which)
+        used = degrees_in_use([rest.gaussians.features_rest])
+        rest = rest.of_degree(max((sh_degree, *used.unique().tolist()))).to(run.device)
         self.is_new = not active.is_whole and bool(run.scene.state(active.geometry.block).deferred.any())
         if active.done == 0 and not run.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
-        if active.done == 0 and not (active.saved or active.is_whole or active.is_joint):
+        is_new_degree = bool(run.config.limits.late_harmonics)  # has had no time to be of use
+        if active.done == 0 and not (active.saved or active.is_alone or is_new_degree):
             self._lower_degrees()
         if active.done == 0 and not active.saved and self.clocks.visits == 0:
             run.health.shrink_oversized(run.views.values(), self._filling())
         self._hold_sizes()
 
+    def raise_degree(self, sh_degree: int) -> None:
+        """Harmonics up to this degree are in training from now on."""
+        raise_degree(self._run.params, self._run.optimizers, sh_degree)
+        self._run.state.sh_degree = max(self._run.state.sh_degree, sh_degree)
+
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
         if GONE in self.growth:  # what was repaired may have them again
             rest = self._run.params["features_rest"]
-            rest.data.masked_fill_(are_gone(self.growth[GONE], rest), 0.0)
-        return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
+            rest.data.masked_fill_(are_gone(self.growth[GONE], rest, self._highest), 0.0)
+        state = detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
+        return state.of_degree(self._highest)
+
+    @property
+    def _highest(self) -> int:
+        return self._run.config.sh_degree
 
     def let_go(self) -> None:
         """Nothing is live any more, and the device has its memory back."""
@@ -145,15 +160,15 @@ class ActiveBlock:
         run = self._run
         if run.density.wants_weights and run.share >= START:
             views = [run.views[view] for view in run.active.trained_on]
-            self.growth = lower(run.params, run.optimizers, self.growth, views)
+            self.growth = lower(run.params, run.optimizers, self.growth, views, self._highest)
 
     def _hold_degrees(self, *_: object) -> None:
         """Before the optimizer steps: harmonics that are gone get no gradient."""
         gone, rest = self.growth.get(GONE), self._run.params["features_rest"]
         if gone is None or rest.grad is None:
             return
-        if self._held is None or self._held[0] is not gone:
-            self._held = gone, are_gone(gone, rest)
+        if self._held is None or self._held[0] is not gone or self._held[1].shape[1] != rest.shape[1]:
+            self._held = gone, are_gone(gone, rest, self._highest)
         rest.grad.masked_fill_(self._held[1], 0.0)
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
@@ -184,4 +199,4 @@ class ActiveBlock:
     def has_outgrown(self) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
         grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
-        return grown and is_full(len(self), 1, self._run.config.limits)
+        return grown and is_full(len(self), 1, self._run.limits)

@@ -1,0 +1,45 @@
+"""Where memory cuts a scene, harmonics come once growth is over, as far as there is room."""
+
+import pytest
+
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
+from abcd_ns.engine.train.memory import GROWING_DEGREE
+from abcd_ns.engine.train.training_loop import train, train_step
+from tests.reference.scenes import STILL, assert_resumes, whole_scene
+
+LATE = {"blocks": 4, "steps": 96, "density": STILL, "late_harmonics": 1}
+ROOMY, TIGHT = 1000, 41
+"""Gaussians that a block may have while it grows; there are 30."""
+
+
+@pytest.fixture
+def start(start):
+    return start.of_degree(0).of_degree(start.sh_degree)
+
+
+def highest_of(coordinator) -> int:
+    """Degree of harmonics that any Gaussian has."""
+    return int(degrees_in_use([whole_scene(coordinator).features_rest]).max())
+
+
+def test_what_is_live_has_no_more_harmonics_than_are_in_use(make, photos, start):
+    coordinator, found = make(block_limit=ROOMY, **LATE), set()
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        if coordinator.state.active is not None:
+            found.add((coordinator.run.share < 0.5, live_gaussians(coordinator.params).sh_degree))
+    assert {degree for is_early, degree in found if is_early} == {GROWING_DEGREE}
+    assert (False, start.sh_degree) in found
+    assert highest_of(coordinator) == start.sh_degree
+
+
+def test_where_there_is_no_room_they_do_not_come(make, photos):
+    coordinator = make(block_limit=TIGHT, **LATE)
+    train(coordinator, photos)
+    assert highest_of(coordinator) == GROWING_DEGREE
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks):
+    assert_resumes(make, photos, 30, 47, 60, **{**LATE, "blocks": blocks}, block_limit=ROOMY)
