@@ -14,11 +14,11 @@ from nerfstudio.utils.misc import step_check
 from abcd_ns.data.input_errors import say
 from abcd_ns.data.ply import GREY
 from abcd_ns.engine.events import HeldOutScored
-from abcd_ns.engine.gaussians.initialize import random_points
+from abcd_ns.engine.gaussians.initialize import PointCloud, random_points
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.flags import as_a_command, check_box, check_held_out, check_tool, opened, shown
@@ -32,7 +32,7 @@ from abcd_ns.nerfstudio.run.settings import write_settings
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import ray_workers
 from abcd_ns.run import STORE
-from abcd_ns.run.begin import Capture, begin_run, gaussians_of_cloud
+from abcd_ns.run.begin import Capture, begin_run, cloud_of
 from abcd_ns.run.fit import RamShares, photo_bytes
 from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB
@@ -175,7 +175,7 @@ class AbcdPipeline(VanillaPipeline):
         manager, model, views = self.datamanager, self.model, self.training_views()
         model.near = views[0].near
         manager.device_photo_bytes = photo_bytes(self.config, self.device)
-        first = partial(self._first_gaussians, views)
+        first = partial(self._first_cloud, views)
         photos, factor = manager.train_dataset.image_filenames, factor_of(manager.dataparser)
         return begin_run(
             self.config,
@@ -200,15 +200,15 @@ class AbcdPipeline(VanillaPipeline):
         """Points of the capture and their colours; none where it has none."""
         return self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
 
-    def _first_gaussians(self, views: list[View]) -> Gaussians:
+    def _first_cloud(self, views: list[View]) -> PointCloud:
         """At the points of the capture or, as splatfacto's, at random places."""
         model, training, (points, colors) = self.model.config, self.config.training, self._cloud
         if len(points) and not model.random_init:
             if len(colors) != len(points):  # as of a .ply without colours
                 colors = torch.full_like(points, GREY)
-            return gaussians_of_cloud(points.cpu().float(), colors.cpu(), views, training)
+            return cloud_of(points.cpu().float(), colors.cpu(), views, training)
         if not len(points) and not isinstance(self.datamanager.dataparser, AbcdDataParser):  # which says so
             where = "at random places, as splatfacto's do"
             say(f"The data has no points: {model.num_random:,} Gaussians begin {where}.")
         at_random = random_points(model.num_random, model.random_scale)
-        return gaussians_of_cloud(*at_random, views, replace(training, point_pixels=0.0))
+        return cloud_of(*at_random, views, replace(training, point_pixels=0.0))
