@@ -1,6 +1,7 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
 import sys
+import time
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -38,6 +39,11 @@ from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
+
+SCORING_SHARE = 0.05
+"""Of a run's training time, for scores of held-out views: half of it before the end."""
+LEAST_SCORED = 32
+"""Held-out views that a score is the mean of, at least, if there are more."""
 
 
 @shown(
@@ -78,6 +84,7 @@ class AbcdPipeline(VanillaPipeline):
         self.coordinator: Trainer | None = None
         """Drives the training, once it has begun."""
         self._drawn: list[Rendered] = []
+        self._view_seconds = self._scoring_seconds = 0.0
         data = self.datamanager.train_dataset
         self.panel = AbcdPanel(self.model, lambda: views_of(data.cameras), lambda row: data.photos.image(row))
 
@@ -138,18 +145,41 @@ class AbcdPipeline(VanillaPipeline):
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
         self._before_evaluation()
-        return super().get_eval_image_metrics_and_images(step)
+        began = time.monotonic()
+        found = super().get_eval_image_metrics_and_images(step)
+        self._view_seconds = time.monotonic() - began
+        return found
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
+        """As VanillaPipeline's; while training, it is no training time, listeners are told, and of many views
+        a sample is scored."""
         self._before_evaluation()
+        self.datamanager.scored, began = self._views_to_score(), time.monotonic()
         with as_a_command():
             found = super().get_average_eval_image_metrics(*args, **kwargs)
+        taken, scored = (
+            time.monotonic() - began,
+            self.datamanager.scored or len(self.datamanager.eval_dataset),
+        )
+        self._scoring_seconds, self._view_seconds = self._scoring_seconds + taken, taken / max(scored, 1)
+        self.datamanager.scored = None
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
             found |= {"lpips": None, "lpips_missing": lpips_missing()}
         return found
+
+    def _views_to_score(self) -> int | None:
+        """Of the held-out views, as many as SCORING_SHARE has time for; None for all."""
+        if self.coordinator is None or not self._view_seconds:
+            return None
+        of_run, there = self.coordinator.stopwatch.seconds, len(self.datamanager.eval_dataset)
+        share = SCORING_SHARE if self.coordinator.finished else SCORING_SHARE / 2
+        wanted = max(int((share * of_run - self._scoring_seconds) / self._view_seconds), LEAST_SCORED)
+        if wanted >= there:
+            return None
+        say(f"Scoring {wanted} of {there} held-out views: all take over {share:.1%} of the training time.")
+        return wanted
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """As VanillaPipeline's; cameras stand where their poses were refined to."""
