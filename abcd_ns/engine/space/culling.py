@@ -42,12 +42,6 @@ def united(a: Box | None, b: Box | None) -> Box | None:
     return Box(torch.minimum(a.lower, b.lower), torch.maximum(a.upper, b.upper))
 
 
-def intersection(a: Box, b: Box) -> Box | None:
-    """What two boxes share, their faces included; None if they are apart."""
-    lower, upper = torch.maximum(a.lower, b.lower), torch.minimum(a.upper, b.upper)
-    return Box(lower, upper) if bool((lower <= upper).all()) else None
-
-
 class Frusta:
     """What some crops look at: the space between five planes each, kept on the CPU.
 
