@@ -14,6 +14,8 @@ PARAM_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opac
 
 NEAR_PLANE = 0.01
 """gsplat's near plane; world units."""
+CHUNK = 1 << 18
+"""Points of a scene's that are looked at at once: what is computed of each takes many times its own bytes."""
 
 
 def as_indices(rows: Tensor | slice) -> Tensor | slice:

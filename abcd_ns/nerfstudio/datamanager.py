@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 from abcd_ns.data.dataset import AbcdDataset, has_views
 from abcd_ns.data.input_errors import InputError, say
 from abcd_ns.engine.events import Event, PhotosWanted
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.step.batch import Batch, Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
@@ -135,6 +136,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     device_photo_bytes: int = 0
     """Of decoded training photos and masks that may be kept on the device; of the others, crops are copied
     there for each step. Of no use on the CPU."""
+    scored: int | None = None
+    """Held-out views that scores are of; None for all."""
 
     def __init__(self, config: AbcdDataManagerConfig, *args: Any, **kwargs: Any) -> None:
         self._coordinator: Trainer | None = None
@@ -238,8 +241,9 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     @property
     def fixed_indices_eval_dataloader(self) -> DataLoader:
-        """All held-out cameras and photos in order, read one at a time."""
-        rows, own = range(len(self.eval_dataset)), torch.Generator()  # a loader draws a seed
+        """Held-out cameras and photos in order, read one at a time: all, or `scored` of them."""
+        held_out, own = range(len(self.eval_dataset)), torch.Generator()  # a loader draws a seed
+        rows = evenly(held_out, len(held_out) if self.scored is None else self.scored)
         return DataLoader(rows, batch_size=None, collate_fn=self._held_out, generator=own)
 
     def get_train_rays_per_batch(self) -> int:

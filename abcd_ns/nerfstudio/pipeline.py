@@ -1,6 +1,7 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
 import sys
+import time
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -14,11 +15,11 @@ from nerfstudio.utils.misc import step_check
 from abcd_ns.data.input_errors import say
 from abcd_ns.data.ply import GREY
 from abcd_ns.engine.events import HeldOutScored
-from abcd_ns.engine.gaussians.initialize import random_points
+from abcd_ns.engine.gaussians.initialize import PointCloud, random_points
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.flags import as_a_command, check_box, check_held_out, check_tool, opened, shown
@@ -32,12 +33,17 @@ from abcd_ns.nerfstudio.run.settings import write_settings
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import ray_workers
 from abcd_ns.run import STORE
-from abcd_ns.run.begin import Capture, begin_run, gaussians_of_cloud
+from abcd_ns.run.begin import Capture, begin_run, cloud_of
 from abcd_ns.run.fit import RamShares, photo_bytes
 from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
+
+SCORING_SHARE = 0.05
+"""Of a run's training time, for scores of held-out views: half of it before the end."""
+LEAST_SCORED = 32
+"""Held-out views that a score is the mean of, at least, if there are more."""
 
 
 @shown(
@@ -78,6 +84,7 @@ class AbcdPipeline(VanillaPipeline):
         self.coordinator: Trainer | None = None
         """Drives the training, once it has begun."""
         self._drawn: list[Rendered] = []
+        self._view_seconds = self._scoring_seconds = 0.0
         data = self.datamanager.train_dataset
         self.panel = AbcdPanel(self.model, lambda: views_of(data.cameras), lambda row: data.photos.image(row))
 
@@ -138,18 +145,41 @@ class AbcdPipeline(VanillaPipeline):
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
         self._before_evaluation()
-        return super().get_eval_image_metrics_and_images(step)
+        began = time.monotonic()
+        found = super().get_eval_image_metrics_and_images(step)
+        self._view_seconds = time.monotonic() - began
+        return found
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
+        """As VanillaPipeline's; while training, it is no training time, listeners are told, and of many views
+        a sample is scored."""
         self._before_evaluation()
+        self.datamanager.scored, began = self._views_to_score(), time.monotonic()
         with as_a_command():
             found = super().get_average_eval_image_metrics(*args, **kwargs)
+        taken, scored = (
+            time.monotonic() - began,
+            self.datamanager.scored or len(self.datamanager.eval_dataset),
+        )
+        self._scoring_seconds, self._view_seconds = self._scoring_seconds + taken, taken / max(scored, 1)
+        self.datamanager.scored = None
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
             found |= {"lpips": None, "lpips_missing": lpips_missing()}
         return found
+
+    def _views_to_score(self) -> int | None:
+        """Of the held-out views, as many as SCORING_SHARE has time for; None for all."""
+        if self.coordinator is None or not self._view_seconds:
+            return None
+        of_run, there = self.coordinator.stopwatch.seconds, len(self.datamanager.eval_dataset)
+        share = SCORING_SHARE if self.coordinator.finished else SCORING_SHARE / 2
+        wanted = max(int((share * of_run - self._scoring_seconds) / self._view_seconds), LEAST_SCORED)
+        if wanted >= there:
+            return None
+        say(f"Scoring {wanted} of {there} held-out views: all take over {share:.1%} of the training time.")
+        return wanted
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """As VanillaPipeline's; cameras stand where their poses were refined to."""
@@ -175,7 +205,7 @@ class AbcdPipeline(VanillaPipeline):
         manager, model, views = self.datamanager, self.model, self.training_views()
         model.near = views[0].near
         manager.device_photo_bytes = photo_bytes(self.config, self.device)
-        first = partial(self._first_gaussians, views)
+        first = partial(self._first_cloud, views)
         photos, factor = manager.train_dataset.image_filenames, factor_of(manager.dataparser)
         return begin_run(
             self.config,
@@ -200,15 +230,15 @@ class AbcdPipeline(VanillaPipeline):
         """Points of the capture and their colours; none where it has none."""
         return self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
 
-    def _first_gaussians(self, views: list[View]) -> Gaussians:
+    def _first_cloud(self, views: list[View]) -> PointCloud:
         """At the points of the capture or, as splatfacto's, at random places."""
         model, training, (points, colors) = self.model.config, self.config.training, self._cloud
         if len(points) and not model.random_init:
             if len(colors) != len(points):  # as of a .ply without colours
                 colors = torch.full_like(points, GREY)
-            return gaussians_of_cloud(points.cpu().float(), colors.cpu(), views, training)
+            return cloud_of(points.cpu().float(), colors.cpu(), views, training)
         if not len(points) and not isinstance(self.datamanager.dataparser, AbcdDataParser):  # which says so
             where = "at random places, as splatfacto's do"
             say(f"The data has no points: {model.num_random:,} Gaussians begin {where}.")
         at_random = random_points(model.num_random, model.random_scale)
-        return gaussians_of_cloud(*at_random, views, replace(training, point_pixels=0.0))
+        return cloud_of(*at_random, views, replace(training, point_pixels=0.0))

@@ -17,9 +17,8 @@ schedule runs over that visit. The store also holds each block as it began, unde
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +26,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, join
+from abcd_ns.engine.gaussians.initialize import PointCloud
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render import Rasterizer
@@ -56,12 +57,10 @@ explain. Behind it, or the ray misses the cell: the block must let all light thr
 lies behind the surface, and nobody can tell what is there."""
 
 
-def independent_at_rest(
-    tree: BlockTree, gaussians: Gaussians
-) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:
+def independent_at_rest(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[BlockName, Packed]]:
     """The first content of a store: every block, and once more every block as it began."""
-    blocks = blocks_at_rest(tree, gaussians)
-    return {**blocks, **{initial_of(block): content for block, content in blocks.items()}}
+    for block, content in blocks_at_rest(tree, start):
+        yield from ((block, content), (initial_of(block), content))
 
 
 def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.run import STATE, STORE
-from abcd_ns.run.begin import Capture, begin_run, gaussians_of_cloud
+from abcd_ns.run.begin import Capture, begin_run, cloud_of
 from abcd_ns.run.options import RunOptions
 
 LOG = logging.getLogger("abcd_ns")
@@ -86,10 +87,8 @@ def train(
     def target(sample: Sample) -> Target:
         return sample.reduced(photo(sample.view.index, sample.source)), None
 
-    def first() -> Gaussians:
-        return gaussians_of_cloud(places, colors, views, training)
-
     names = [Path(str(view.index)) for view in views]
+    first = partial(cloud_of, places, colors, views, training)
     capture = Capture(views, names, target, first, len(places))
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
     live, budget = nothing_live(training.sh_degree, device), Budget(steps, options.max_seconds)

@@ -14,7 +14,7 @@ from abcd_ns.cluster.assignment import Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out, thin_points
+from abcd_ns.engine.gaussians.initialize import PointCloud, cloud_from_points, thin_out, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
@@ -31,7 +31,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
@@ -68,10 +68,10 @@ class Capture:
     """Their photos; a run resumes on photos of the same names and sizes alone."""
     target: Callable[[Sample], Target]
     """Gives what a sample is trained on."""
-    gaussians: Callable[[], Gaussians]
+    cloud: Callable[[], PointCloud]
     """Makes what a new run begins with."""
     points: int
-    """In the cloud that these are made from; 0 where they are at random places."""
+    """That the capture has; 0 where the run begins with others."""
     factor: int = 1
     """By which the photos' width and height were divided."""
 
@@ -81,21 +81,21 @@ class Capture:
         return max(view.full.pixels for view in self.views)
 
 
-def gaussians_of_cloud(
+def cloud_of(
     points: Float[Tensor, "n 3"],
     colors: UInt8[Tensor, "n 3"] | Float[Tensor, "n 3"],
     views: Sequence[View],
     training: TrainingConfig,
-) -> Gaussians:
+) -> PointCloud:
     """One Gaussian for each point that the views can tell apart.
 
     Args:
         points: world space.
         colors: 0..255.
     """
-    points, colors = thin_points(points, colors.float(), views, training.point_pixels)
+    points, colors = thin_points(points, colors, views, training.point_pixels)
     flat = training.primitive == "2dgs"
-    return gaussians_from_points(points.float(), colors, sh_degree=training.sh_degree, flat=flat)
+    return cloud_from_points(points.float(), colors, sh_degree=training.sh_degree, flat=flat)
 
 
 def begin_run(
@@ -228,46 +228,48 @@ def _new_store(
 ) -> ParameterStore:
     """The store of a run that begins, with all blocks."""
     training = options.training
-    gaussians = _first_gaussians(capture, training, say)
+    cloud = _first_cloud(capture, training, say)
     blocks, fitted = options.blocks, {name: getattr(training.limits, name) for name in FITTED}
     if blocks == 0:
-        fit = _fit(options, capture, device, device_bytes, len(gaussians))
+        fit = _fit(options, capture, device, device_bytes, len(cloud))
         say(fit.in_words())
         workers = options.workers if has_workers(options) else 0
         blocks, fitted = blocks_to_begin_with(fit, workers), fit.limits
     if options.partition == "kd":
-        tree = build_kd(gaussians.means, blocks)
+        tree = build_kd(cloud.means, blocks)
     else:
-        tree = build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
-    keep = _coarse_model_size(options, capture, len(gaussians), tree.num_blocks, fitted)
+        tree = build_grid(cloud.means, counts=grid_counts(cloud.means, blocks))
+    keep = _coarse_model_size(options, capture, len(cloud), tree.num_blocks, fitted)
     header = {"tree": tree.to_json(), **fitted, COARSE_MODEL: keep or 0, ASKED: options.blocks}
     store = ParameterStore.create(folder, {**header, **made_for.header()})
     if training.recipe.overlap > 0:
-        store.commit(independent_at_rest(tree, gaussians))
+        content = independent_at_rest(tree, cloud)
     else:
-        store.commit(blocks_at_rest(tree, gaussians, room=keep, seed=training.seed))
+        content = blocks_at_rest(tree, cloud, room=keep, seed=training.seed)
+    del cloud  # it goes as soon as it is parted
+    store.commit(content)
     return store
 
 
-def _first_gaussians(capture: Capture, training: TrainingConfig, say: Say) -> Gaussians:
+def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointCloud:
     """No more than the scene may have."""
-    everything, points = capture.gaussians(), capture.points
+    everything, points = capture.cloud(), capture.points
     if len(everything) < points:
         merged = f"merged {points:,} points closer than these photos resolve"
         say(f"Starting with {len(everything):,} Gaussians: {merged}.")
-    gaussians = thin_out(everything, training.density.limit, training.seed)
-    if len(gaussians) < len(everything):
-        say(f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit.")
-    return gaussians
+    kept = thin_out(everything, training.density.limit, training.seed)
+    if len(kept) < len(everything):
+        say(f"Training begins with {len(kept):,} of {len(everything):,} Gaussians, the limit.")
+    return kept
 
 
-def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
+def grid_counts(means: Float[Tensor, "n 3"], blocks: int) -> tuple[int, int, int]:
     """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all.
 
     Raises:
         UserError: these would be over MAX_BLOCKS.
     """
-    low, high = robust_range(gaussians.means.double().cpu())
+    low, high = robust_range(means.cpu())
     extent = (high - low).clamp_min(1e-9).tolist()
     counts = [1, 1, 1]
     while (cells := math.prod(counts)) < blocks and cells <= MAX_BLOCKS:

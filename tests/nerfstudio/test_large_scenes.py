@@ -1,5 +1,7 @@
 """Pictures of a scene that the device could not draw at once: node by node, and still the merged picture."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
@@ -72,6 +74,30 @@ def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     assert_same_surfaces(found, surfaces)
     assert max(drawn) < count
     assert len(drawn) > len(expected)
+
+
+def test_scores_take_a_share_of_the_training_time(trained, monkeypatch, capsys):
+    monkeypatch.setattr("abcd_ns.nerfstudio.pipeline.LEAST_SCORED", 1)
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    there, told = len(pipeline.datamanager.eval_dataset), []
+    run = SimpleNamespace(seconds=0.0)
+    pipeline.coordinator = SimpleNamespace(
+        stopwatch=run, finished=False, pause=lambda: None, announce=told.append
+    )
+    looked_at, draw = [], pipeline.model.get_outputs_for_camera
+    monkeypatch.setattr(
+        pipeline.model, "get_outputs_for_camera", lambda *a, **k: (looked_at.append(1), draw(*a, **k))[1]
+    )
+    # Training seconds, of which a view takes 1; whether the run is complete; views.
+    for seconds, finished, expected in ((1e6, False, there), (40.0, True, there), (40.0, False, 1)):
+        pipeline._view_seconds, pipeline._scoring_seconds, run.seconds = 1.0, 0.0, seconds
+        pipeline.coordinator.finished = finished
+        looked_at.clear()
+        pipeline.get_average_eval_image_metrics()
+        assert len(looked_at) == expected
+        assert ("held-out views" in capsys.readouterr().out) == (expected < there)
+    assert len(told) == 3
+    assert there == 2
 
 
 def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):

@@ -18,7 +18,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio import metrics
@@ -236,7 +236,7 @@ def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
     config = AbcdModelConfig(sh_degree=0)
     model = config.setup(scene_box=SceneBox(torch.zeros(2, 3)), num_train_data=1)
     color = torch.tensor([[0.8, 0.5, 0.1]])
-    gaussians = gaussians_from_points(torch.zeros(1, 3), 255 * color, sh_degree=0)
+    gaussians = cloud_from_points(torch.zeros(1, 3), 255 * color, sh_degree=0).gaussians()
     model.gauss_params["features_dc"] = torch.nn.Parameter(gaussians.features_dc)
     assert model.colors.allclose(color, atol=0.01)
     assert torch.equal(model.shs_0, gaussians.features_dc)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer, ZWindow
@@ -18,8 +19,9 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import blocks_at_rest, pack_points
 from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -121,7 +123,10 @@ def make_coordinator(
     else:
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-        store.commit(content(tree, gaussians, *([] if coarse_model is None else [coarse_model])))
+        if coarse_model is not None:
+            gaussians, others = split_off(gaussians, coarse_model, seed=0)
+            store.commit({DEFERRED: pack_points(points_of(others))})
+        store.commit(content(tree, gaussians))
     config = training_config(sh_degree=gaussians.sh_degree, **training)
     run = TrainingRun(
         config,
@@ -137,6 +142,12 @@ def make_coordinator(
     if resume:
         coordinator.restore()
     return coordinator
+
+
+def points_of(gaussians: Gaussians) -> PointCloud:
+    """Points where Gaussians are, as a run begins with them."""
+    fields = (gaussians.means, gaussians.scales[:, :1], gaussians.quats, gaussians.features_dc)
+    return PointCloud(*fields, gaussians.sh_degree)
 
 
 def training_config(**options) -> TrainingConfig:

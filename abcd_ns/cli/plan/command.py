@@ -17,7 +17,7 @@ from torch import Tensor
 from abcd_ns import methods
 from abcd_ns.cli.plan.forecast import Forecast, Wanted, in_words, shares_of, time_steps
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.memory import levels_of, needs_of
 from abcd_ns.engine.train.schedule import views_per_step
@@ -112,7 +112,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     needs = needs_of(training, pixels, fit.blocks)
     needs = replace(needs, levels=levels_of(fit.blocks), keeps=not on_cpu)
     fullest = owner == counts.argmax()
-    gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
+    gaussians = cloud_from_points(points[fullest], capture.colors[fullest]).gaussians().to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
     with console.status("Timing a step"):
         seconds = time_steps(gaussians, spread, training, batch)

@@ -11,12 +11,13 @@ from functools import partial
 from typing import Literal
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.space.culling import Frusta, Optics, intersection
+from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
 from abcd_ns.engine.space.visibility import reaches
@@ -103,6 +104,7 @@ class LayerRenderer:
         self.device = torch.device(device)
         self._pass_gaussians = pass_gaussians
         self._optics = Optics(views, rasterizer.slack)
+        self._drawn: dict[int, tuple[Box | None, Tensor | None]] = {}
 
     @property
     def tree(self) -> BlockTree:
@@ -151,14 +153,22 @@ class LayerRenderer:
 
     def _shown(self, node: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
         """Of these blocks, those with fragments in the node that some crop may show, and which crops."""
-        known = ((b, self.scene.bounds(b)) for b in blocks)
-        boxes = {b: self._optics.drawn_within(bounds) for b, bounds in known if bounds is not None}
-        if self.ownership == "fragments":
-            space = self.tree.box(node)
-            shared = {b: intersection(box, space) for b, box in boxes.items()}
-            boxes = {b: box for b, box in shared.items() if box is not None}
-        rows = seen_by.may_show(list(boxes.values())).tolist()
+        boxes = {b: box for b in blocks if (box := self._drawn_within(b)) is not None}
+        if self.ownership == "fragments" and boxes:
+            space, lower, upper = self.tree.box(node), *torch.stack(list(boxes.values())).unbind(1)
+            shared = torch.stack((lower.maximum(space.lower), upper.minimum(space.upper)), dim=1)
+            meets = (shared[:, 0] <= shared[:, 1]).all(dim=1).tolist()
+            boxes = {b: box for b, box, meet in zip(boxes, shared, meets, strict=True) if meet}
+        rows = seen_by.may_show([Box(*box) for box in boxes.values()]).tolist()
         return {b: row for b, row in zip(boxes, rows, strict=True) if any(row)}
+
+    def _drawn_within(self, block: int) -> Float64[Tensor, "2 3"] | None:
+        """Corners of the box that a block's fragments lie in; kept while its bounds are."""
+        bounds = self.scene.bounds(block)
+        if block not in self._drawn or self._drawn[block][0] is not bounds:
+            box = None if bounds is None else self._optics.drawn_within(bounds)
+            self._drawn[block] = bounds, None if box is None else torch.stack((box.lower, box.upper))
+        return self._drawn[block][1]
 
     def _reach(self, box: Box, means: Tensor, scales: Tensor) -> Tensor:
         """Which Gaussians some view may see inside a box, [n]."""

@@ -35,10 +35,11 @@ def bounds_of(gaussians: Gaussians) -> Box | None:
     return Box(lower, upper)
 
 
-def intersection(a: Box, b: Box) -> Box | None:
-    """What two boxes share, their faces included; None if they are apart."""
-    lower, upper = torch.maximum(a.lower, b.lower), torch.minimum(a.upper, b.upper)
-    return Box(lower, upper) if bool((lower <= upper).all()) else None
+def united(a: Box | None, b: Box | None) -> Box | None:
+    """The smallest box that holds both."""
+    if a is None or b is None:
+        return a or b
+    return Box(torch.minimum(a.lower, b.lower), torch.maximum(a.upper, b.upper))
 
 
 class Frusta:
@@ -50,8 +51,7 @@ class Frusta:
 
     def __init__(self, seen: Iterable[tuple[View, Crop]], slack: float) -> None:
         self.seen = tuple(seen)
-        planes = [_planes(view, crop, ROUNDING + slack) for view, crop in self.seen]
-        self._planes = torch.stack(planes) if planes else torch.zeros(0, 5, 4, dtype=torch.float64)
+        self._planes = _planes(self.seen, ROUNDING + slack)
 
     def may_show(self, boxes: Sequence[Box]) -> Bool[Tensor, "n v"]:
         """Whether something in each box may be drawn in each crop; False is certain.
@@ -65,19 +65,32 @@ class Frusta:
         # A corner without end may give NaN, which is not below 0: then the box may show.
         return ~(inward < 0).all(dim=3).any(dim=2)
 
+    def hold(self, points: Float[Tensor, "n 3"], rows: Sequence[int]) -> Bool[Tensor, "r"]:
+        """Whether any of the points is inside, of the frusta at `rows`."""
+        planes = self._planes[list(rows)]
+        inward = torch.einsum("na,vpa->pnv", in_float64(points).cpu(), planes[..., :3])
+        return (inward + planes[..., 3].T[:, None]).amin(dim=0).amax(dim=0) >= 0
 
-def _planes(view: View, crop: Crop, margin: float) -> Float64[Tensor, "5 4"]:
+
+def _planes(seen: Sequence[tuple[View, Crop]], margin: float) -> Float64[Tensor, "v 5 4"]:
     """(a, b) of each plane, a x + b >= 0 being the side that is seen."""
-    matrix, K = in_float64(view.viewmat).cpu(), in_float64(view.K).cpu()
-    x, y, z = matrix[:3]
+    if not seen:
+        return torch.zeros(0, 5, 4, dtype=torch.float64)
+    views, crops = zip(*seen, strict=True)
+    matrices, K = (
+        in_float64(torch.stack([getattr(view, name) for view in views])).cpu() for name in ("viewmat", "K")
+    )
+    starts, sizes = torch.tensor(crops, dtype=torch.float64)[..., None].split(2, dim=1)
+    z = matrices[:, 2]
     near = z.clone()
-    near[3] -= view.near
+    near[:, 3] -= torch.tensor([view.near for view in views], dtype=torch.float64)
     planes = [near]
-    for row, axis, start, size in ((x, 0, crop.x, crop.width), (y, 1, crop.y, crop.height)):
-        pixel = K[axis, axis] * row + K[axis, 2] * z  # the pixel's coordinate times z
-        planes.append(pixel - (start - margin) * z)
-        planes.append((start + size + margin) * z - pixel)
-    return torch.stack(planes)
+    for axis in range(2):
+        # The pixel's coordinate times z.
+        pixel = K[:, axis, axis, None] * matrices[:, axis] + K[:, axis, 2, None] * z
+        planes.append(pixel - (starts[:, axis] - margin) * z)
+        planes.append((starts[:, axis] + sizes[:, axis] + margin) * z - pixel)
+    return torch.stack(planes, dim=1)
 
 
 def _corners(boxes: Float64[Tensor, "n 2 3"]) -> Float64[Tensor, "n 8 3"]:

@@ -8,6 +8,7 @@ others are drawn small for it.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -169,14 +170,17 @@ def _put(influence: Influence, view: int, row: Sequence[float]) -> None:
             influence.setdefault(block, {})[view] = share
 
 
-def overlap(influence: Influence, block: int, others: Iterable[int]) -> float:
-    """How much of a block is shown where others are: the sum over these of the cosine between influences."""
-    own, found = influence.get(block, {}), 0.0
-    for other in others:
-        theirs = influence.get(other, {})
-        shared = sum(share * theirs.get(view, 0.0) for view, share in own.items())
-        found += shared / max(math.hypot(*own.values()) * math.hypot(*theirs.values()), TINY)
-    return round(found, DIGITS)
+def overlaps(influence: Influence, blocks: Iterable[int], others: Iterable[int]) -> list[float]:
+    """How much of each block is shown where others are: the sum over these of influences' cosines."""
+    beside: Counter[int] = Counter()
+    for theirs in (influence.get(other, {}) for other in others):
+        length = max(math.hypot(*theirs.values()), TINY)
+        beside.update({view: share / length for view, share in theirs.items()})
+    found = []
+    for own in (influence.get(block, {}) for block in blocks):
+        shared = sum(own[view] * beside[view] for view in own.keys() & beside)
+        found.append(round(shared / max(math.hypot(*own.values()), TINY), DIGITS))
+    return found
 
 
 def coarser(view: View, times: int) -> View:

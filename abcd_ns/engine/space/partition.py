@@ -6,7 +6,7 @@ from itertools import count
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, in_float64, tree_from_rows
+from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, tree_from_rows
 
 MAX_BLOCKS = 65_536
 """The most blocks that space may be cut into to begin with, and the most cells of a grid: far more than any
@@ -28,10 +28,10 @@ def best_split(points: Float[Tensor, "n 3"], box: Box, share: float = 0.5) -> tu
         (axis, threshold), for BlockTree.split. The threshold lies strictly inside the box, and strictly
         between two points' coordinates where float64 has room there.
     """
-    points, total = in_float64(points).cpu(), len(points)
+    points, total = points.detach().cpu(), len(points)
     best: tuple[float, int, float] | None = None
     for axis in _axes_by_extent(points):
-        cut = _cut_along(points[:, axis], share * total)
+        cut = _cut_along(points[:, axis].double(), share * total)
         if cut is not None and (best is None or cut[0] < best[0]):
             best = (cut[0], axis, cut[1])
         if best is not None and best[0] <= 0.1 * total:
@@ -53,7 +53,7 @@ def build_kd(points: Float[Tensor, "n 3"], num_blocks: int) -> BlockTree:
     if num_blocks < 1:
         raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
     _check_finite(points)
-    return _flatten(_kd_node(in_float64(points).cpu(), EVERYWHERE, num_blocks))
+    return _flatten(_kd_node(points.detach().cpu(), EVERYWHERE, num_blocks))
 
 
 def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> BlockTree:
@@ -70,7 +70,7 @@ def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> Bl
     if min(counts) < 1 or math.prod(counts) > MAX_BLOCKS:
         raise ValueError(f"a grid has at least one cell on each axis and {MAX_BLOCKS} in all, not {counts}")
     _check_finite(points)
-    start, stop = robust_range(in_float64(points).cpu())
+    start, stop = robust_range(points.detach().cpu())
     # Without any extent every cell size is as good as another; 1 keeps the planes apart.
     sizes = [(extent or 1.0) / n for extent, n in zip((stop - start).tolist(), counts, strict=True)]
     grid = zip(start.tolist(), sizes, counts, strict=True)
@@ -86,7 +86,7 @@ def _kd_node(points: Tensor, box: Box, k: int) -> tuple | None:
     if k == 1:
         return None
     axis, threshold = best_split(points, box, (k // 2) / k)
-    below = points[:, axis] < threshold
+    below = points[:, axis].double() < threshold
     lower, upper = box.lower.clone(), box.upper.clone()
     upper[axis] = lower[axis] = threshold
     left = _kd_node(points[below], Box(box.lower, upper), k // 2)
@@ -105,18 +105,19 @@ def _grid_node(planes: list[list[float]]) -> tuple | None:
     return axis, planes[axis][middle], _grid_node(below), _grid_node(above)
 
 
-def robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+def robust_range(points: Float[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
     """The 5th and 95th percentile on each axis; zeros without points."""
     points = points if len(points) else points.new_zeros((1, 3))
     tail = int(0.05 * (len(points) - 1))
-    return points.kthvalue(tail + 1, dim=0).values, points.kthvalue(len(points) - tail, dim=0).values
+    ends = (points.kthvalue(k, dim=0).values.double() for k in (tail + 1, len(points) - tail))
+    return tuple(ends)
 
 
-def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
+def _axes_by_extent(points: Float[Tensor, "n 3"]) -> list[int]:
     """Axes from the widest to the narrowest; by the full range where the bulk of the points coincides."""
     start, stop = robust_range(points)
     robust = (stop - start).tolist()
-    full = (points.amax(dim=0) - points.amin(dim=0)).tolist() if len(points) else robust
+    full = (points.amax(dim=0).double() - points.amin(dim=0)).tolist() if len(points) else robust
     return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))
 
 

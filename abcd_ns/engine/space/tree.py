@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from abcd_ns.engine.types import CHUNK
+
 FORMAT = "abcd_ns.block_tree/1"
 
 
@@ -104,6 +106,9 @@ class BlockTree:
 
     def assign(self, points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
         """The block that holds each point, on the points' device. A NaN goes to the right."""
+        return torch.cat([self._assign(part) for part in points.split(CHUNK)])
+
+    def _assign(self, points: Tensor) -> Tensor:
         exact = in_float64(points)
         device = exact.device
         axis, threshold = self.axis.to(device), self.threshold.to(device)

@@ -7,14 +7,16 @@ unseen until that is visited for the first time: neighbours look to each other a
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.initialize import split_off
+from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians
@@ -39,18 +41,34 @@ def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
     return {block: state[owner == block] for block in owner.unique().tolist()}
 
 
+def by_block(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[int, BlockState]]:
+    """Each block with its part of what a scene begins with, nothing of it trained; one is made at a time."""
+    owner = tree.assign(start.means)
+    ends = list(accumulate(owner.bincount(minlength=tree.num_blocks).tolist(), initial=0))
+    order = owner.argsort(stable=True)
+    del owner
+    for block, (first, last) in enumerate(pairwise(ends)):
+        part = start[order[first:last]]
+        yield block, BlockState.fresh(part if isinstance(part, Gaussians) else part.gaussians())
+
+
 def blocks_at_rest(
-    tree: BlockTree, gaussians: Gaussians, room: int | None = None, seed: int = 0
-) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:
-    """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
+    tree: BlockTree, start: Gaussians | PointCloud, room: int | None = None, seed: int = 0
+) -> Iterator[tuple[BlockName, Packed]]:
+    """The first content of a store: `start` parted by `tree`, nothing trained yet; one block at a time.
 
     Args:
+        start: points where there is a warm-up.
         room: for Gaussians in the coarse model; others are deferred. None for no warm-up.
     """
-    if room is None:
-        at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
-        nobody = BlockState.fresh(gaussians[:0])
-        return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
-    coarse_model, deferred = split_off(gaussians, min(room, len(gaussians)), seed)
-    points = BlockState.fresh(deferred).packed()
-    return {**blocks_at_rest(tree, coarse_model), DEFERRED: points}
+    if room is not None:
+        start, deferred = split_off(start, room, seed)
+        yield DEFERRED, pack_points(deferred)
+        del deferred
+    for block, state in by_block(tree, start):
+        yield block, state.packed()
+
+
+def pack_points(points: PointCloud) -> Packed:
+    """Deferred points, for the store."""
+    return Packed(points.tensors, {"sh_degree": points.sh_degree, "flat": points.flat})

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
-from abcd_ns.engine.store.coarse_model import defer, split_by_block
+from abcd_ns.engine.gaussians.initialize import PointCloud
+from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.store.coarse_model import by_block, defer, pack_points, split_by_block
 from abcd_ns.engine.store.scene import StoredScene, VisitScene
 from abcd_ns.engine.store.special_blocks import DEFERRED, LIVE, PENDING, WHOLE, BlockName
 
@@ -45,7 +47,7 @@ def with_pending(scene: VisitScene, block: int) -> BlockState:
 
 def commit(
     scene: StoredScene, block: BlockName, state: BlockState, migrate: bool = True, taken: int | None = None
-) -> dict[BlockName, BlockState]:
+) -> dict[BlockName, BlockState | Packed]:
     """What changes when `block`, or with WHOLE the coarse model of all, has been trained.
 
     Args:
@@ -82,17 +84,17 @@ def without(scene: StoredScene, state: BlockState, blocks: Iterable[int]) -> Blo
     return state[~torch.isin(_owner(scene, state), torch.tensor(sorted(blocks)))]
 
 
-def commit_coarse_model(scene: StoredScene, state: BlockState) -> dict[BlockName, BlockState]:
+def commit_coarse_model(scene: StoredScene, state: BlockState) -> dict[BlockName, BlockState | Packed]:
     """Every block with its part of the coarse model and of the deferred points, of which none are left."""
-    deferred = scene.state(DEFERRED)
+    tensors, meta = scene.table(DEFERRED)
+    deferred = PointCloud(**tensors, **meta)
     trained = split_by_block(state, _owner(scene, state))
-    arrivals = split_by_block(defer(deferred), _owner(scene, deferred))
-    nobody = replace(deferred.nobody, clocks=state.clocks)
+    nobody = replace(BlockState.fresh(deferred[:0].gaussians()), clocks=state.clocks)
     committed = {
-        block: join([trained.get(block, nobody), arrivals.get(block, nobody)])
-        for block in range(scene.tree.num_blocks)
+        block: join([trained.pop(block, nobody), defer(arrivals)])
+        for block, arrivals in by_block(scene.tree, deferred)
     }
-    return {**committed, DEFERRED: deferred.nobody}
+    return {**committed, DEFERRED: pack_points(deferred[:0])}
 
 
 def _owner(scene: StoredScene, state: BlockState) -> Tensor:

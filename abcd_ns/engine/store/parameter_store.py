@@ -3,7 +3,7 @@
 import copy
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +26,9 @@ from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
 from abcd_ns.units import bytes_in_words
+
+Content = tuple[dict[str, Tensor], dict[str, Any]]
+"""Of a block: tensors and JSON."""
 
 
 class ParameterStore:
@@ -152,18 +155,19 @@ class ParameterStore:
 
     def commit(
         self,
-        updates: Mapping[BlockName, tuple[dict[str, Tensor], dict[str, Any]]],
+        updates: Mapping[BlockName, Content] | Iterable[tuple[BlockName, Content]],
         header: dict[str, Any] | None = None,
         state: dict[str, Any] | None = None,
     ) -> int:
         """Make a new generation in which these blocks are replaced or added; return its number.
 
         All or nothing, and durable when it returns. Tensors may be of any device, dtype and strides;
-        shards are written one after another. None keeps the present header or state.
+        shards are written one after another, and pairs asked for one after another. None keeps the present
+        header or state.
 
         Raises:
-            StoreError: too little space, which is found before anything is written, or a write that failed:
-                the new files are gone, unless the disk refuses even to put the old manifest back;
+            StoreError: too little space, found before anything of a mapping is written, or a write that
+                failed: the new files are gone, unless the disk refuses even to put the old manifest back;
                 `generation` tells.
             TypeError, ValueError: something is not JSON.
         """
@@ -171,10 +175,14 @@ class ParameterStore:
         old = self._manifest
         generation = old.generation + 1
         with self._or_roll_back(f"Writing generation {generation} failed"):
-            self._require_space(sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values()))
+            if isinstance(updates, Mapping):
+                self._require_space(
+                    sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values())
+                )
+                updates = updates.items()
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, meta)
-                for block, (tensors, meta) in updates.items()
+                for block, (tensors, meta) in updates
             }
             fsync_folder(self.folder)
             crash_points.reached(crash_points.SHARDS_IN_PLACE)

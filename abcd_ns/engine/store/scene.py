@@ -15,7 +15,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
-from abcd_ns.engine.space.culling import bounds_of
+from abcd_ns.engine.space.culling import bounds_of, united
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
@@ -109,7 +109,8 @@ class StoredScene(VisitScene):
         self._unsaved: dict[BlockName, Packed] = {}
         self._writer = WriteBehind(store, self._saved)
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
-        self._bounds: dict[int, tuple[int, Box | None]] = {}
+        self._bounds: dict[BlockName, tuple[int, Box | None]] = {}
+        self._stored_bounds: dict[BlockName, Box | None] = {}
         self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
         self._rested = time.monotonic()
         self._pending_by_block: dict[int, BlockState] = {}
@@ -147,6 +148,7 @@ class StoredScene(VisitScene):
                 self._memory.forget(name)
                 self._unsaved[name] = block
                 self._versions[name] = next(self._numbers)
+                self._stored_bounds.pop(name, None)
             if header is not None or PENDING in blocks:
                 self._sort(blocks.get(PENDING, self.pending))
             unsaved = self.unsaved_bytes  # under the lock: the writer takes out what it has written
@@ -340,7 +342,13 @@ class StoredScene(VisitScene):
             return bounds_of(self.gaussians(block))
         version = self.version(block)
         if block not in self._bounds or self._bounds[block][0] != version:
-            self._bounds[block] = (version, bounds_of(self.gaussians_at_rest(block)))
+            with self._writer.mutex:  # it may come to rest meanwhile
+                if block not in self._stored_bounds:
+                    self._stored_bounds[block] = bounds_of(self.stored(block))
+                migrants, box = self.pending_for(block), self._stored_bounds[block]
+            if migrants is not None:  # the block itself need not be read again
+                box = united(box, bounds_of(migrants.gaussians))
+            self._bounds[block] = (version, box)
         return self._bounds[block][1]
 
 

@@ -1,14 +1,15 @@
 """Which block is trained next, on which views, and for how many steps."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
-from abcd_ns.engine.space.culling import Frusta, Optics
-from abcd_ns.engine.space.influence import overlap, worth_training
+from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
+from abcd_ns.engine.space.influence import overlaps, worth_training
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -28,6 +29,8 @@ from abcd_ns.errors import UserError
 
 DOUBTED = 8
 """Views that hardly show a block, as far as known, of which a visit looks at the first that sees it."""
+MANY, SAMPLE = 100, 64
+"""Of a block that more views may see, only so many Gaussians, evenly spaced, are looked for in them."""
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many epochs."""
 
@@ -86,7 +89,7 @@ class Planner(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
-        self._culling: tuple[dict[int, View], Frusta, Optics] | None = None
+        self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
@@ -125,13 +128,11 @@ class Planner(Visits):
             plan = self._next_plan(state, at_once)
             views = self._may_see(plan.block)
             # Where nothing is known, or what shows the block has changed, all views are asked.
-            known = self._known_to_show(state, plan.block, views)
-            active = self._visit(state, plan, views, known, sh_degree) or self._visit(
-                state, plan, views, self._footprints(plan.block, views).views, sh_degree
-            )
-            if active is not None:
-                active.began = began
-                return active
+            for ask in (partial(self._known_to_show, state), self._sampled, self._seeing):
+                active = self._visit(state, plan, views, ask(plan.block, views), sh_degree)
+                if active is not None:
+                    active.began = began
+                    return active
 
     def _visit(
         self,
@@ -202,7 +203,8 @@ class Planner(Visits):
         free = [place for place, plan in enumerate(state.queue) if plan.block not in busy]
         if not free:
             raise BlocksBusyError
-        return state.queue.pop(min(free, key=lambda k: overlap(state.influence, state.queue[k].block, busy)))
+        beside = overlaps(state.influence, (state.queue[place].block for place in free), busy)
+        return state.queue.pop(free[beside.index(min(beside))])
 
     def _plan_epoch(self, state: RunState, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
@@ -241,7 +243,22 @@ class Planner(Visits):
         return views
 
     def _views_that_see(self, block: int) -> int:
-        return len(self._footprints(block, self._may_see(block)).views)
+        views = self._may_see(block)
+        return len(self._sampled(block, views) or self._seeing(block, views))
+
+    def _seeing(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
+        """Those of the views that see the block."""
+        return self._footprints(block, views).views
+
+    def _sampled(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
+        """Of MANY views, those in which a mean of the block's lies, as far as SAMPLE tell; of fewer, none."""
+        if len(views) <= MANY:
+            return ()
+        means = self._scene.gaussians_at_rest(block).means
+        found, _, inner, _ = self._culling
+        rows = [row for row, view in enumerate(found) if view in views]
+        holds = inner.hold(means[:: -(-len(means) // SAMPLE)], rows).tolist()
+        return tuple(view for view, held in zip(views, holds, strict=True) if held)
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
@@ -256,8 +273,9 @@ class Planner(Visits):
         found = self._run.views
         if self._culling is None or self._culling[0] is not found:  # poses moved
             views, slack = list(found.values()), self._run.rasterizer.slack
-            self._culling = found, Frusta(((v, v.full) for v in views), slack), Optics(views, slack)
-        _, frusta, optics = self._culling
+            outer, inner = (Frusta(((v, v.full) for v in views), by) for by in (slack, -ROUNDING - 1))
+            self._culling = found, outer, inner, Optics(views, slack)
+        _, frusta, _, optics = self._culling
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 

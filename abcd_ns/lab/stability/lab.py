@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
@@ -66,7 +66,7 @@ class Stage:
     def capture(self, sh_degree: int) -> Capture:
         """What a run of this degree is trained on; it begins with a Gaussian for each point."""
         names = [Path(str(view.index)) for view in self.views]
-        start = partial(gaussians_from_points, self.points.float(), self.colors, sh_degree=sh_degree)
+        start = partial(cloud_from_points, self.points.float(), self.colors, sh_degree=sh_degree)
         return Capture(self.views, names, self.target, start, len(self.points))
 
     def only(self, count: int) -> "Stage":

@@ -8,20 +8,21 @@ import torch
 
 from abcd_ns.engine.gaussians.initialize import (
     THICKNESS,
-    gaussians_from_points,
+    PointCloud,
+    cloud_from_points,
     random_points,
+    spacing,
     split_off,
     thin_out,
 )
-from abcd_ns.engine.types import Gaussians
 
 
 @pytest.fixture(scope="module")
-def many() -> Gaussians:
-    return gaussians_from_points(*random_points(400, 2.0), sh_degree=0)
+def many() -> PointCloud:
+    return cloud_from_points(*random_points(400, 2.0), sh_degree=0)
 
 
-def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
+def rows(gaussians: PointCloud) -> set[tuple[float, ...]]:
     return {tuple(row) for row in gaussians.means.tolist()}
 
 
@@ -67,15 +68,25 @@ def test_fewer_gaussians_are_wider_so_that_no_gaps_are_left(many):
 def test_too_few_points_are_warned_of_and_give_numbers_all_the_same(points, warns):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        made = gaussians_from_points(points, torch.zeros(len(points), 3))
+        made = cloud_from_points(points, torch.zeros(len(points), 3)).gaussians()
     assert ["too few" in str(warning.message) for warning in caught] == [True] * warns
     assert len(made) == len(points)
     assert all(bool(torch.isfinite(value).all()) for _, value in made.items())
 
 
+@pytest.mark.parametrize("chunk", [7, 1000])
+def test_a_point_is_as_wide_as_its_three_nearest_are_far(monkeypatch, chunk):
+    monkeypatch.setattr("abcd_ns.engine.gaussians.initialize.CHUNK", chunk)
+    points, _ = random_points(50, 2.0)
+    points[10:13] = points[9]  # four in one place
+    expected = torch.cdist(points.double(), points.double()).sort(dim=1).values[:, 1:4].mean(dim=1)
+    expected[9:13] = expected[expected > 0].min()
+    torch.testing.assert_close(spacing(points), expected.float(), rtol=1e-6, atol=0)
+
+
 def test_surfels_begin_flat_and_stay_so_where_they_are_widened():
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
-    discs = gaussians_from_points(points, torch.zeros(40, 3), flat=True)
+    discs = cloud_from_points(points, torch.zeros(40, 3), flat=True)
     chosen, others = split_off(discs, 10, seed=0)
-    assert bool((torch.cat((chosen.scales, others.scales))[:, 2] == THICKNESS).all())
-    assert bool((chosen.scales[:, :2] > discs.scales[:, :2].mean()).all())
+    assert all(bool((part.gaussians().scales[:, 2] == THICKNESS).all()) for part in (chosen, others))
+    assert bool((chosen.gaussians().scales[:, :2] > discs.scales.mean()).all())

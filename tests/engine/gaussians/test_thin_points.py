@@ -1,5 +1,8 @@
 """Points that no view can tell apart become one."""
 
+import math
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -55,6 +58,28 @@ def test_points_that_nobody_sees_stay_and_so_do_all_at_0():
     unseen = points + torch.tensor([0.0, 0.0, 500.0])
     assert len(thin_points(unseen, colors, VIEWS, 2.0)[0]) == 40
     assert thin_points(points, colors, VIEWS, 0.0)[0] is points
+
+
+def by_cube(points, colors, pixels: float) -> dict[tuple, list[torch.Tensor]]:
+    """Rows of place and colour by cube, one point after the other; unseen points have cubes of their own."""
+    cubes: dict[tuple, list[torch.Tensor]] = {}
+    for row, (point, size) in enumerate(zip(points, pixels * finest_pixel(points, VIEWS), strict=True)):
+        level = math.floor(math.log2(size)) if size.isfinite() else None
+        cube = (-1000, row) if level is None else (level, *(point.double() / 2.0**level).floor().tolist())
+        cubes.setdefault(cube, []).append(torch.cat((point, colors[row])).double())
+    return cubes
+
+
+@pytest.mark.parametrize("chunk", [7, 1000])
+def test_points_of_a_cube_become_their_mean_cubes_in_order(monkeypatch, chunk):
+    monkeypatch.setattr("abcd_ns.engine.gaussians.initialize.CHUNK", chunk)
+    points, colors = cloud(200, 6, width=0.3)
+    points[::11] += 400.0  # unseen
+    cubes = by_cube(points, colors, 3.0)
+    found = torch.cat(thin_points(points, colors, VIEWS, 3.0), dim=1)
+    assert 60 < len(found) == len(cubes) < 190
+    expected = torch.stack([torch.stack(cubes[cube]).mean(dim=0) for cube in sorted(cubes)])
+    torch.testing.assert_close(found, expected.float(), rtol=1e-6, atol=1e-6)
 
 
 def test_fine_photos_keep_what_coarse_ones_do_not():

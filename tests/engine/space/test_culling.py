@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.space.culling import BOUNDS_SLANT, Frusta, Optics, bounds_of
+from abcd_ns.engine.space.culling import BOUNDS_SLANT, ROUNDING, Frusta, Optics, bounds_of
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import EVERYWHERE, Box
 from abcd_ns.engine.store.scene import MemoryScene
@@ -49,6 +49,15 @@ def test_what_may_not_show_draws_nothing(seed, size, where, crop):
         if not shown:
             drawn = DRAW(gaussians, view, crop=crop, sh_degree=0).layer
             assert bool((drawn.transmittance == 1).all())
+
+
+@given(seed=st.integers(0, 1000), spread=st.sampled_from([0.5, 2.0, 9.0]))
+def test_frusta_hold_what_their_cameras_see(seed, spread):
+    points = spread * torch.randn(5, 3, generator=torch.Generator().manual_seed(seed)).double()
+    views = ring_of_views(6, dtype=torch.float64)
+    rows = [4, 1, 0]
+    held = Frusta([(view, view.full) for view in views], -ROUNDING).hold(points, rows)
+    assert held.tolist() == [bool(views[row].depths_of(points)[1].any()) for row in rows]
 
 
 def test_most_of_what_is_beside_and_behind_is_passed_over():

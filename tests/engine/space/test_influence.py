@@ -10,7 +10,7 @@ from abcd_ns.engine.space.influence import (
     InfluenceTable,
     coarser,
     influence,
-    overlap,
+    overlaps,
     share_shown,
     weights,
     weights_by_pixel,
@@ -128,9 +128,6 @@ def test_the_fewest_views_that_hold_the_share(views, share):
 
 def test_blocks_overlap_where_the_same_views_show_them():
     influence = {0: {1: 0.2, 2: 0.4}, 1: {1: 0.1, 2: 0.2}, 2: {3: 0.5}, 3: {2: 0.3, 3: 0.4}}
-    assert overlap(influence, 0, [1]) == pytest.approx(1.0)
-    assert overlap(influence, 0, [2]) == 0.0
-    assert overlap(influence, 0, [3]) == pytest.approx(0.4 * 0.3 / (0.5 * 0.2**0.5), abs=1e-5)
-    assert overlap(influence, 0, [1, 2, 3]) == pytest.approx(1.0 + overlap(influence, 0, [3]), abs=1e-5)
-    assert overlap(influence, 0, []) == 0.0
-    assert overlap(influence, 9, [0]) == 0.0  # nobody sees it
+    third = 0.4 * 0.3 / (0.5 * 0.2**0.5)
+    for others, expected in (([1], 1.0), ([2], 0.0), ([3], third), ([1, 2, 3], 1.0 + third), ([], 0.0)):
+        assert overlaps(influence, [0, 9], others) == pytest.approx([expected, 0.0], abs=1e-5)  # none sees 9

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
-from abcd_ns.engine.gaussians.block_state import Clocks
-from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, split_off
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
@@ -22,6 +24,21 @@ LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 def warm_up_is_not_prolonged(monkeypatch):
     """Its share of the run is known beforehand then."""
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 1)
+
+
+def test_a_store_begins_with_each_point_in_its_block_or_deferred():
+    cloud = cloud_from_points(*random_points(90, 2.0), sh_degree=1)
+    tree = build_kd(cloud.means, 4)
+    coarse, others = split_off(cloud, 40, seed=3)
+    content = dict(blocks_at_rest(tree, cloud, room=40, seed=3))
+    deferred = content.pop(DEFERRED)
+    assert all(torch.equal(deferred.tensors[name], value) for name, value in others.tensors.items())
+    owner, whole = tree.assign(coarse.means), coarse.gaussians()
+    for block, packed in content.items():
+        state = BlockState.unpacked(packed)
+        assert scenes.equal(state.gaussians, whole[owner == block])
+        assert not bool(state.deferred.any() | state.exp_avg.means.any() | state.exp_avg_sq.quats.any())
+    assert list(content) == [0, 1, 2, 3]
 
 
 def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, photos):

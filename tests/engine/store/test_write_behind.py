@@ -12,6 +12,7 @@ import torch
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import DRAWN
+from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore, StoreError, parameter_store
 from abcd_ns.engine.store.block_memory import BlockMemory
@@ -75,6 +76,19 @@ def test_what_waits_is_left_out_and_pending_migrants_are_drawn_picked_or_not(sce
     expected = seen if which is None else seen[which(seen.means, seen.scales)]
     assert which is None or 0 < len(expected) < len(seen)
     assert equal(expected, scene.drawn(1, "cpu", which))
+
+
+def test_bounds_follow_migrants_without_another_look_at_the_block(scene, monkeypatch):
+    state = scene.state(1)
+    assert scene.bounds(1).upper.tolist() == bounds_of(state.gaussians).upper.tolist()
+    monkeypatch.setattr(scene, "stored", None)
+    for rows in ([0, 1], [4], []):
+        migrants = BlockState.fresh(state.gaussians[torch.tensor(rows, dtype=torch.long)])
+        migrants.gaussians.scales[:] += 2.0
+        scene.rest(scene.tree, {PENDING: migrants}, {}, within=60.0)
+        box, expected = scene.bounds(1), bounds_of(Gaussians.cat([state.gaussians, migrants.gaussians]))
+        assert box.lower.tolist() == expected.lower.tolist()
+        assert box.upper.tolist() == expected.upper.tolist()
 
 
 # The queue

@@ -34,6 +34,19 @@ def test_who_is_hidden_is_no_part_of_an_epoch_until_looked_at_again(make, photos
         coordinator.state.health.clear()
 
 
+def test_of_many_views_a_sample_of_a_block_tells_which_see_it(make, views, monkeypatch):
+    plans = []
+    for many in (len(views), 0):
+        monkeypatch.setattr("abcd_ns.engine.train.planner.MANY", many)
+        coordinator = make(str(many), blocks=4, steps=200, warmup=0.0)
+        coordinator.next_batch()
+        plans.append((coordinator.state.views, coordinator.state.active.trained_on))
+    (exact, all_that_see), (sampled, some) = plans
+    assert set(some) <= set(all_that_see)
+    assert sampled.keys() == exact.keys()
+    assert all(0 < sampled[block] <= exact[block] for block in exact)
+
+
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_photos_of_a_step_and_of_those_to_come_are_wanted(make, blocks):
     coordinator = make(blocks=blocks, steps=24)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import unsound
@@ -31,13 +31,13 @@ def test_pictures_of_any_size_train_together(tmp_path):
 def test_a_block_inside_an_opaque_ball_is_visited_once_and_then_passed_over(tmp_path):
     draw = {"generator": torch.Generator().manual_seed(1)}
     shell = 0.5 * torch.nn.functional.normalize(torch.randn((900, 3), **draw), dim=1)
-    wall = gaussians_from_points(shell, torch.full((900, 3), 128.0), sh_degree=1)
+    wall = cloud_from_points(shell, torch.full((900, 3), 128.0), sh_degree=1).gaussians()
     wall = replace(
         wall, scales=torch.full_like(wall.scales, math.log(0.08)), opacities=torch.full((900, 1), 8.0)
     )
-    inside = gaussians_from_points(
+    inside = cloud_from_points(
         0.02 * torch.randn((30, 3), **draw), torch.full((30, 3), 255.0), sh_degree=1
-    )
+    ).gaussians()
     tree, origin = build_kd(torch.zeros(0, 3), 1), torch.zeros(1, 3)
     for axis in range(3):
         for at in (-0.2, 0.2):

@@ -36,6 +36,8 @@ LOSS = 0.05
 """Of the mean PSNR of training views, dB, that it may cost."""
 RANKING = 16
 """Views that a block was trained on, for each that Gaussians are ranked by: of a short run not all are."""
+MOST_RANKED = 256
+"""Of these at most: for each, all that it shows is read and drawn twice."""
 FEWEST, MOST, STEPS_EACH = 5, 32, 100
 """Views that tell how much may go: at least, at most, and steps of a short run for each."""
 ROUNDS = 6
@@ -135,7 +137,7 @@ class FinalPruning:
         run = self._run
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
-        chosen = evenly(views, max(trained // RANKING, FEWEST))
+        chosen = evenly(views, min(max(trained // RANKING, FEWEST), MOST_RANKED))
         probe = _Probe()
         pictures = self._whole.pictures(chosen, ChangedScene(scene, probe.with_leaf))
         drawn = random_signs(run.config.seed)
