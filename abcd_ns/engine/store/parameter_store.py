@@ -1,7 +1,6 @@
 """Blocks on disk: one immutable shard per block and generation, and one manifest that names those in use."""
 
 import copy
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,7 +24,6 @@ from abcd_ns.engine.store.manifest import (
 from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
-from abcd_ns.units import bytes_in_words
 
 
 class ParameterStore:
@@ -162,16 +160,14 @@ class ParameterStore:
         shards are written one after another. None keeps the present header or state.
 
         Raises:
-            StoreError: too little space, which is found before anything is written, or a write that failed:
-                the new files are gone, unless the disk refuses even to put the old manifest back;
-                `generation` tells.
+            StoreError: a write failed, as on a full disk: the new files are gone, unless the disk refuses
+                even to put the old manifest back; `generation` tells.
             TypeError, ValueError: something is not JSON.
         """
         self._require_writable()
         old = self._manifest
         generation = old.generation + 1
         with self._or_roll_back(f"Writing generation {generation} failed"):
-            self._require_space(sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values()))
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, meta)
                 for block, (tensors, meta) in updates.items()
@@ -278,14 +274,6 @@ class ParameterStore:
     def _require_writable(self) -> None:
         if self._lock is None:
             raise StoreError(f"{self.folder} is open for reading; open it without `read_only` and `name`.")
-
-    def _require_space(self, needed: int) -> None:
-        free = shutil.disk_usage(self.folder).free
-        if needed > free:
-            raise StoreError(
-                f"{self.folder} has {bytes_in_words(free)} free but the next generation needs "
-                f"{bytes_in_words(needed)}. Free space and go on; generation {self.generation} is intact."
-            )
 
     def _publish(self, manifest: Manifest) -> None:
         """Make `manifest` the present one, on disk and here. Its shards must be on disk."""
