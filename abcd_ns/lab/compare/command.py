@@ -31,7 +31,7 @@ from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
-from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, parse_changes, words
+from abcd_ns.lab.runs.options import Flag, check_numbers, check_ranges, parse_changes, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
 
@@ -303,7 +303,7 @@ def _settings(given: Options) -> Settings:
         raise UserError("Give each run's budget: either --seconds or --steps.")
     if given.seconds is not None and not 0 < given.seconds < math.inf:
         raise UserError(f"--seconds is {given.seconds}; it must be above 0 and finite.")
-    check_ranges({name: getattr(given, name) for name in LOWEST})
+    check_ranges({name: getattr(given, name) for name in ("downscale", "steps", "evals", "pictures")})
     if max(given.blocks, default=1) > MAX_BLOCKS:
         raise UserError(f"--blocks is {max(given.blocks)}; it must be at most {MAX_BLOCKS}.")
     return Settings(

@@ -1,9 +1,8 @@
-"""The courts of `abcd synth`: where they lie, what stands in each, and the cameras that walk them."""
+"""The walled court of `abcd demo`: what stands in it, and the cameras that walk it."""
 
 import math
 import zlib
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,11 +13,12 @@ from abcd_ns.lab.world.sunlight import SunlitWorld
 from abcd_ns.lab.world.textures import Color, Material
 from abcd_ns.lab.world.world import camera
 
-Layout = Literal["grid", "row"]
 CELL = 12.0
-"""Side of a court, metres, from the middle of one wall to the middle of the next."""
+"""Side of the court, metres, from the middle of one wall to the middle of the next."""
 INNER = CELL / 2 - 0.3
-"""From a court's centre to the inner face of its walls, metres."""
+"""From the court's centre to the inner face of its walls, metres."""
+DOME = 60.0
+"""Radius of the sky about the origin, metres."""
 HEIGHT = 3.4
 """Of the walls, without their battlements, metres."""
 FOCAL = 0.72
@@ -107,71 +107,22 @@ def gate(center: float, material: Material, grow: float = 0.0, deep: float = 0.5
     ]
 
 
-@dataclass(frozen=True)
-class Site:
-    """The plan: which cells of a lattice hold courts."""
-
-    cells: tuple[tuple[int, int], ...]
-    """(column, row) of each court."""
-    seed: int
-
-    @staticmethod
-    def plan(courts: int, layout: Layout, seed: int) -> "Site":
-        """`courts` cells in one row, or filled row by row in the smallest near-square grid."""
-        columns = courts if layout == "row" else int(np.ceil(np.sqrt(courts)))
-        return Site(tuple((i % columns, i // columns) for i in range(courts)), seed)
-
-    @property
-    def _middle(self) -> np.ndarray:
-        cells = np.array(self.cells, np.float64)
-        return (cells.min(axis=0) + cells.max(axis=0)) / 2
-
-    def center(self, court: int) -> np.ndarray:
-        """The middle of a court's ground [3], metres; the site's middle is the origin."""
-        return np.append((np.array(self.cells[court]) - self._middle) * CELL, 0.0)
-
-    @property
-    def dome(self) -> float:
-        """Radius of the sky about the origin, metres."""
-        spread = np.ptp(np.array(self.cells), axis=0) + 1
-        return max(60.0, 2.5 * float(np.linalg.norm(spread) * CELL / 2))
-
-    def neighbors(self, court: int) -> list[int]:
-        """The courts whose cells touch this one's, corners included."""
-        here = np.array(self.cells[court])
-        return [i for i, c in enumerate(self.cells) if np.abs(here - c).max() == 1]
-
-    def rng(self, *key: object) -> np.random.Generator:
-        """A random stream of its own for each key; independent of the order of use."""
-        return np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
-
-    def walls(self, court: int) -> list[tuple[int, bool]]:
-        """(side, whether a court lies beyond) of the walls that this court builds: 0..3 are north, west,
-        south, east. A shared wall is built by the court to its south or west."""
-        column, row = self.cells[court]
-        beyond = [(column, row + 1), (column - 1, row), (column, row - 1), (column + 1, row)]
-        return [(k, at in self.cells) for k, at in enumerate(beyond) if at not in self.cells or k in (0, 3)]
-
-    def gate(self, court: int, side: int, shared: bool) -> float | None:
-        """Where a wall has a gate, metres from its middle; each that parts two courts has one, others may."""
-        rng = self.rng("edge", self.cells[court], side)
-        center = rng.uniform(-0.6, 0.6)
-        return center if shared or rng.random() < 0.5 else None
+def stream(seed: int, *key: object) -> np.random.Generator:
+    """A random stream of its own for each key; independent of the order of use."""
+    return np.random.default_rng([seed, zlib.crc32(repr(key).encode())])
 
 
-def build_world(site: Site) -> SunlitWorld:
-    """All courts on a meadow."""
-    h = 1.1 * site.dome
-    things = [Thing((block((-h, -h, -1.02), (h, h, -0.02), GRASS),))]
-    for court in range(len(site.cells)):
-        things.append(build_court(site, court))
-    return SunlitWorld(things, site.dome, site.seed)
+def build_world(seed: int) -> SunlitWorld:
+    """The court on a meadow, its middle at the origin."""
+    h = 1.1 * DOME
+    meadow = Thing((block((-h, -h, -1.02), (h, h, -0.02), GRASS),))
+    return SunlitWorld([meadow, build_court(seed)], DOME, seed)
 
 
-def build_court(site: Site, court: int) -> Thing:
-    """Everything that stands in one court, in world coordinates."""
-    rng = site.rng("court", court)
-    style = int(rng.integers(len(STYLES)) + court) % len(STYLES)
+def build_court(seed: int) -> Thing:
+    """Everything that stands in the court."""
+    rng = stream(seed, "court", 0)
+    style = int(rng.integers(len(STYLES)))
     base, mortar, third, size = STYLES[style]
     light = tuple(min(0.7, 0.35 + 0.5 * c) for c in base)
     wall = Material("blocks", base, mortar, third, size, float(rng.integers(60)))
@@ -181,8 +132,8 @@ def build_court(site: Site, court: int) -> Thing:
     )
     h = CELL / 2
     things = [Thing((block((-h, -h, -1.0), (h, h, 0.0), flags),))]
-    for side, shared in site.walls(court):
-        parts = _wall(site.gate(court, side, shared), wall, trim)
+    for side in range(4):
+        parts = _wall(_gate_of(seed, side), wall, trim)
         things.append(Thing(tuple(parts)).placed(yaw=side * np.pi / 2))
     for k, turn in enumerate(np.arange(4) * np.pi / 2):
         place, make = (INNER - 0.75, INNER - 0.75, 0.0), FURNITURE[rng.integers(len(FURNITURE))]
@@ -194,11 +145,18 @@ def build_court(site: Site, court: int) -> Thing:
         angle = start + k * np.pi / 2 + rng.uniform(-0.2, 0.2)
         at = (2.5 * np.cos(angle), 2.5 * np.sin(angle), 0.0)
         things.append(Thing(tuple(FURNITURE[which](rng))).placed(at, angle + np.pi / 2))
-    return Thing(tuple(things)).placed(site.center(court))
+    return Thing(tuple(things))
+
+
+def _gate_of(seed: int, side: int) -> float | None:
+    """Where a wall has a gate, metres from its middle; half of them have one."""
+    rng = stream(seed, "edge", (0, 0), side)
+    center = rng.uniform(-0.6, 0.6)
+    return center if rng.random() < 0.5 else None
 
 
 def _wall(center: float | None, wall: Material, trim: Material) -> list[Solid]:
-    """The northern wall of a court at the origin: plinth, gate with a frame, cornice, battlements."""
+    """The northern wall: plinth, gate with a frame, cornice, battlements."""
     h, middle, pitch = CELL / 2, (0, CELL / 2, 0), CELL / 10
     low, high = (-h, INNER), (h, CELL - INNER)
 
@@ -218,18 +176,17 @@ def _wall(center: float | None, wall: Material, trim: Material) -> list[Solid]:
     ]
 
 
-def court_cameras(site: Site, court: int, count: int, size: tuple[int, int]) -> list[View]:
-    """`count` cameras (float64) on a rising spiral above one court's walls, all looking into it.
+def court_cameras(seed: int, count: int, size: tuple[int, int]) -> list[View]:
+    """`count` cameras (float64) on a rising spiral above the court's walls, all looking into it.
 
     Any part of the list looks from all around, and what a held-out view shows is in its neighbours' views.
     """
-    rng = site.rng("cameras", court)
-    phase, middle = rng.uniform(0, 2 * np.pi), site.center(court)
-    views = []
+    rng = stream(seed, "cameras", 0)
+    phase, views = rng.uniform(0, 2 * np.pi), []
     for k in range(count):
         angle, up = phase + k * TURN, np.interp((k + 0.5) / count, (0, 1), HEIGHTS)
         radius = 11.0 - 0.3 * up + rng.uniform(-0.3, 0.3)
-        eye = middle + np.array([radius * math.cos(angle), radius * math.sin(angle), up])
-        target = middle + np.append(rng.uniform(-0.5, 0.5, 2), 2.0)
+        eye = np.array([radius * math.cos(angle), radius * math.sin(angle), up])
+        target = np.append(rng.uniform(-0.5, 0.5, 2), 2.0)
         views.append(camera(eye, target, k, size, FOCAL, torch.float64))
     return views

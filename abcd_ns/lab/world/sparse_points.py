@@ -1,6 +1,5 @@
 """Scene points with their observations, as structure from motion would leave them, and the model of these."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,34 +30,24 @@ class SparsePoints:
     """[P, 3] metres, world."""
     rgb: NDArray[np.uint8]
     """[P, 3] sRGB."""
-    seen: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]
-    """By camera, in the list of all cameras: which points it observes, ascending, and where, [n, 2] in pixels
-    (pixel centres at +0.5)."""
+    seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]]
+    """By camera: which points it observes, ascending, and where, [n, 2] in pixels (pixel centres at +0.5)."""
 
 
-def court_points(
-    world: SunlitWorld, views: list[View], own: range, nearby: list[int], count: int, rng: np.random.Generator
-) -> SparsePoints:
-    """About `count` points that the cameras `own` of one court see, each in at least two cameras.
-
-    Args:
-        views: all cameras of the scene.
-        own: indices of the court's cameras, through whose pixels the points are drawn.
-        nearby: indices of every camera that may observe them, `own` included.
-        count: wanted number of points; fewer where the views overlap too little.
-    """
-    tries = int(np.ceil(1.6 * count / len(own)))
-    drawn = [_through_pixels(world, views[c], tries, rng) for c in own]
+def court_points(world: SunlitWorld, views: list[View], count: int, rng: np.random.Generator) -> SparsePoints:
+    """About `count` points, each seen by at least two cameras; fewer where the views overlap too little."""
+    tries = int(np.ceil(1.6 * count / len(views)))
+    drawn = [_through_pixels(world, view, tries, rng) for view in views]
     xyz, rgb, is_sky = (torch.cat(column) for column in zip(*drawn, strict=True))
-    seen = [_observe(world, views[c], xyz) for c in nearby]
+    seen = [_observe(world, view, xyz) for view in views]
     order = rng.permutation(len(xyz))
     order = order[np.sum([visible for visible, _ in seen], axis=0)[order] >= 2]
     sky_rank = np.cumsum(is_sky.numpy()[order])
     order = order[~is_sky.numpy()[order] | (sky_rank <= _SKY_SHARE * count)][:count]
-    found = {}
-    for camera, (visible, xy) in zip(nearby, seen, strict=True):
+    found = []
+    for visible, xy in seen:
         rows = np.flatnonzero(visible[order])
-        found[camera] = rows, xy[order][rows]
+        found.append((rows, xy[order][rows]))
     return SparsePoints(xyz.numpy()[order], rgb.numpy()[order], found)
 
 
@@ -82,29 +71,25 @@ def _observe(world: SunlitWorld, view: View, xyz: Tensor) -> tuple[NDArray[np.bo
     return visible.numpy(), xy.numpy()
 
 
-def write_model(folder: Path, cameras: dict[str, View], parts: Sequence[SparsePoints]) -> None:
+def write_model(folder: Path, cameras: dict[str, View], sparse: SparsePoints) -> None:
     """Write cameras.bin, images.bin and points3D.bin with one shared pinhole camera, by the writer that
     nerfstudio has of COLMAP's own.
 
-    Ids count from 1: image i is the i-th of `cameras`, by its file's name; points are numbered through.
-    Stored errors are 0, because observations are exact projections.
+    Ids count from 1: image i is the i-th of `cameras`, by its file's name. Stored errors are 0, because
+    observations are exact projections.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    starts = np.cumsum([0, *(len(part.xyz) for part in parts)])
-    tracks: list[list[tuple[int, int]]] = [[] for _ in range(starts[-1])]
+    tracks: list[list[tuple[int, int]]] = [[] for _ in sparse.xyz]
     images, points = {}, {}
     for i, (name, view) in enumerate(cameras.items()):
-        seen = [(start + part.seen[i][0], part.seen[i][1]) for start, part in zip(starts, parts, strict=False)
-                if i in part.seen]  # fmt: skip
-        rows, xy = map(np.concatenate, zip(*seen, strict=True))
+        rows, xy = sparse.seen[i]
         for slot, row in enumerate(rows.tolist()):
             tracks[row].append((i + 1, slot))
         turn = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
         pose = turn[[3, 0, 1, 2]], view.viewmat[:3, 3]
         images[i] = colmap.Image(i + 1, *pose, 1, name, xy, rows + 1)
-    xyz, rgb = (np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "rgb"))
     for j, track in enumerate(tracks):
-        points[j] = colmap.Point3D(j + 1, xyz[j], rgb[j], 0.0, *np.array(track).T)
+        points[j] = colmap.Point3D(j + 1, sparse.xyz[j], sparse.rgb[j], 0.0, *np.array(track).T)
     view = next(iter(cameras.values()))
     (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
     shared = colmap.Camera(1, "PINHOLE", view.width, view.height, (fx, fy, cx, cy))
