@@ -23,7 +23,7 @@ from abcd_ns.run import STATE
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.texts import clock
 
-SCENE = {"views": 56, "size": (256, 192), "points": 24_000}
+SCENE = {"count": 56, "size": (256, 192), "points": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
@@ -39,7 +39,7 @@ def demo(
 ) -> int:
     """Make a small scene, train it block by block, export it and write a report. Needs no GPU and no data.
 
-    Draws a walled court, and runs `ns-train abcd`, `ns-export gaussian-splat` and `abcd report`.
+    Draws five balls on a table, and runs `ns-train abcd`, `ns-export gaussian-splat` and `abcd report`.
 
     Args:
         out: Folder for the results: new, empty, or of an earlier demo.
@@ -55,7 +55,7 @@ def demo(
         (out / "logs").mkdir(exist_ok=True)
     run = out / "training" / "demo" / "abcd" / time.strftime("%Y-%m-%d_%H%M%S")
     console, began = Console(), time.monotonic()
-    steps = {"A scene: a walled court": partial(_draw_scene, out / "scene")}
+    steps = {"A scene: five balls on a table": partial(_draw_scene, out / "scene")}
     titles = "Training", "Export for other viewers", "A page about the run"
     for title, command in zip(titles, _commands(out, run, seconds, blocks), strict=True):
         steps[title] = partial(_run, command, out / "logs", console)
@@ -93,11 +93,11 @@ def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[st
 def _draw_scene(scene: Path) -> None:
     """Draw it, unless an earlier demo has."""
     # Here and not above: torch takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.lab.world.court_scene import SOURCE, draw_court
+    from abcd_ns.lab.world.table_scene import MODEL, draw_table
 
-    if not (scene / SOURCE).exists():
+    if not (scene / MODEL).exists():
         with taking(scene):
-            draw_court(scene, **SCENE)
+            draw_table(scene, **SCENE)
 
 
 def _flags(options: Mapping[str, Any]) -> list[str]:

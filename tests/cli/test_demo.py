@@ -68,7 +68,7 @@ class StandIns:
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
     monkeypatch.setattr(demo_module, "tool", lambda name: str(stand_ins.folder / name))
-    monkeypatch.setattr(demo_module, "SCENE", {"views": 3, "size": (32, 24), "points": 30, "supersample": 1})
+    monkeypatch.setattr(demo_module, "SCENE", {"count": 3, "size": (32, 24), "points": 30})
     return stand_ins
 
 
