@@ -93,9 +93,9 @@ def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[st
 def _draw_scene(scene: Path) -> None:
     """Draw it, unless an earlier demo has."""
     # Here and not above: torch takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.lab.world.table_scene import MODEL, draw_table
+    from abcd_ns.lab.world.table_scene import LAST, draw_table
 
-    if not (scene / MODEL).exists():
+    if not (scene / LAST).exists():
         with taking(scene):
             draw_table(scene, **SCENE)
 

@@ -13,8 +13,9 @@ from abcd_ns.lab.world.world import TABLE, Surfaces, ring
 from abcd_ns.progress_bar import ProgressBar
 
 WORLD = Surfaces(tuple(replace(surface, fineness=4.0) for surface in TABLE.surfaces))
-MODEL = Path("sparse") / "0"
-"""Is written last, so that a folder with it is whole."""
+MODEL = Path("sparse/0")
+LAST = MODEL / "points3D.bin"
+"""A folder with this file is whole."""
 
 
 def draw_table(out: Path, count: int, size: tuple[int, int], points: int) -> None:
