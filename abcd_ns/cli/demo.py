@@ -4,6 +4,7 @@ import math
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,7 @@ from abcd_ns.run import STATE
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.texts import clock
 
-SCENE = {"courts": 1, "views-per-court": 56, "width": 256, "height": 192, "points-per-court": 24_000}
+SCENE = {"count": 56, "size": (256, 192), "points": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
@@ -38,7 +39,7 @@ def demo(
 ) -> int:
     """Make a small scene, train it block by block, export it and write a report. Needs no GPU and no data.
 
-    Runs `abcd synth`, `ns-train abcd`, `ns-export gaussian-splat` and `abcd report`.
+    Draws five balls on a table, and runs `ns-train abcd`, `ns-export gaussian-splat` and `abcd report`.
 
     Args:
         out: Folder for the results: new, empty, or of an earlier demo.
@@ -54,11 +55,14 @@ def demo(
         (out / "logs").mkdir(exist_ok=True)
     run = out / "training" / "demo" / "abcd" / time.strftime("%Y-%m-%d_%H%M%S")
     console, began = Console(), time.monotonic()
-    titles = "A scene: a walled court", "Training", "Export for other viewers", "A page about the run"
-    for number, command in enumerate(_commands(out, run, seconds, blocks)):
+    steps = {"A scene: five balls on a table": partial(_draw_scene, out / "scene")}
+    titles = "Training", "Export for other viewers", "A page about the run"
+    for title, command in zip(titles, _commands(out, run, seconds, blocks), strict=True):
+        steps[title] = partial(_run, command, out / "logs", console)
+    for number, (title, step) in enumerate(steps.items(), 1):
         now = clock(time.monotonic() - began)
-        console.print(f"\n[bold]{now}  {number + 1}/{len(titles)}  {titles[number]}[/]", highlight=False)
-        _run(command, out / "logs", console)
+        console.print(f"\n[bold]{now}  {number}/{len(steps)}  {title}[/]", highlight=False)
+        step()
     _sum_up(out, run, seconds, time.monotonic() - began, console)
     return 0
 
@@ -80,11 +84,20 @@ def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[st
     exported = {"load-config": run / "config.yml", "output-dir": out, "output-filename": "splat.ply"}
     page = {"data": scene, "out": out / "report.html"}
     return [
-        ["abcd", "synth", str(scene), *_flags(SCENE), "--overwrite"],
         ["ns-train", "abcd", *_flags(options)],
         ["ns-export", "gaussian-splat", *_flags(exported)],
         ["abcd", "report", str(run), *_flags(page)],
     ]
+
+
+def _draw_scene(scene: Path) -> None:
+    """Draw it, unless an earlier demo has."""
+    # Here and not above: torch takes seconds to import, and `--help` has no use for it.
+    from abcd_ns.lab.world.table_scene import LAST, draw_table
+
+    if not (scene / LAST).exists():
+        with taking(scene):
+            draw_table(scene, **SCENE)
 
 
 def _flags(options: Mapping[str, Any]) -> list[str]:

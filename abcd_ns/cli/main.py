@@ -53,7 +53,6 @@ COMMANDS = (
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as triangles"),
     Command("compare", "abcd_ns.lab.compare.command:compare", "compare methods, numbers of blocks, options"),
     Command("stability", "abcd_ns.lab.stability.command:stability", "run small scenes on which methods fail"),
-    Command("synth", "abcd_ns.lab.synth.command:synth", "render a synthetic scene to train on"),
     Command(
         "completion", "abcd_ns.cli.completion:completion", "print a script that completes words in a shell"
     ),

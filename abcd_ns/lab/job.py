@@ -45,9 +45,6 @@ class Settings:
     steps: int | None
     evals: int
     """Points of the curve of held-out PSNR over training time, the end included."""
-    max_gaussians: int
-    """In the whole scene; 0 means no limit."""
-    densify: bool
     pictures: int
     """Held-out views that are shown."""
     hold_out: HoldOut = "interval"

@@ -108,7 +108,7 @@ def test_a_bug_keeps_its_traceback(greet, name):
 def wrong_words() -> list[tuple[str, str]]:
     """What users type by mistake, in a folder with a run, a photo and nothing else; and what is said."""
     return [
-        ("snyth", "abcd has no command 'snyth'; did you mean 'abcd synth'?"),
+        ("dmeo", "abcd has no command 'dmeo'; did you mean 'abcd demo'?"),
         ("--verbose", "abcd has no command '--verbose'; there are: demo, doctor,"),
         ("report absent", "absent is no run with abcd/settings.json: there is no such folder"),
         ("report photo.jpg", "photo.jpg is no run"),

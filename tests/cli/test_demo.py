@@ -17,7 +17,6 @@ from abcd_ns.cli import demo as demo_module
 from abcd_ns.cli.demo import demo
 from abcd_ns.cli.report.command import report
 from abcd_ns.errors import UserError
-from abcd_ns.lab.synth.command import synth
 from tests.cli.report.runs import line, log_lines
 from tests.test_documents import no_deed
 
@@ -41,8 +40,6 @@ if name == "ns-train":
     (run / "abcd" / "log.jsonl").write_text((here / "log.jsonl").read_text())
 elif name == "ns-export":
     assert given("--load-config").is_file()
-elif words[0] == "synth":
-    pathlib.Path(words[1]).mkdir(exist_ok=True)
 elif words[0] == "report":
     assert (pathlib.Path(words[1]) / "config.yml").is_file()
     given("--out").write_text("a page")
@@ -71,6 +68,7 @@ class StandIns:
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
     monkeypatch.setattr(demo_module, "tool", lambda name: str(stand_ins.folder / name))
+    monkeypatch.setattr(demo_module, "SCENE", {"count": 3, "size": (32, 24), "points": 30})
     return stand_ins
 
 
@@ -78,15 +76,14 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capf
     out = tmp_path / "demo"
     assert demo(out=out, seconds=5.0, blocks=3) == 0
     calls = commands.calls()
-    assert [name for name, *_ in calls] == ["abcd", "ns-train", "ns-export", "abcd"]
-    tyro.cli(no_deed(synth), args=calls[0][2:])
-    tyro.cli(no_deed(report), args=calls[3][2:])
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=calls[1][1:])
+    assert [name for name, *_ in calls] == ["ns-train", "ns-export", "abcd"]
+    tyro.cli(no_deed(report), args=calls[2][2:])
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=calls[0][1:])
     assert (config.pipeline.blocks, config.pipeline.max_seconds) == (3, 5.0)
     assert config.steps_per_eval_all_images > 0  # or the end is not scored
     assert config.data == (out / "scene").resolve()
     printed = capfd.readouterr().out
-    assert f"$ abcd synth {out / 'scene'} --courts 1" in printed
+    assert f"$ ns-train abcd --data {out / 'scene'}" in printed
     figures = ("24.50 dB, SSIM 0.750", "1,234", "3.0 GiB", "0 of 3 blocks")
     for part in (*figures, str(out / "splat.ply"), str(out / "report.html"), "abcd demo --seconds 10"):
         assert part in printed

@@ -7,7 +7,7 @@ import weakref
 import pytest
 import torch
 
-from abcd_ns.engine.events import BlockSplit, PrunedAtEnd, VisitEnded
+from abcd_ns.engine.events import BlockSplit, PrunedAtEnd
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render import TorchRasterizer
@@ -130,16 +130,6 @@ def test_a_warm_up_is_trained_and_blocks_that_outgrow_their_limit_are_split(on_d
     assert coordinator.state.step == 14
     assert splits
     assert coordinator.scene.tree.num_blocks == 2 + len(splits)
-
-
-def test_gaussians_migrate(on_device, photos):
-    coordinator = on_device(blocks=4, steps=12)
-    ended = listen(coordinator, VisitEnded)
-    while not coordinator.finished:
-        train(coordinator, photos, steps=1)
-        with torch.no_grad():
-            coordinator.params["means"].add_(0.1 * torch.randn_like(coordinator.params["means"]))
-    assert sum(event.migrated for event in ended) > 0
 
 
 def test_what_is_no_number_is_repaired(on_device, photos):

@@ -1,7 +1,6 @@
 """Blocks on disk: one immutable shard per block and generation, and one manifest that names those in use."""
 
 import copy
-import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,7 +24,6 @@ from abcd_ns.engine.store.manifest import (
 from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
-from abcd_ns.units import bytes_in_words
 
 Content = tuple[dict[str, Tensor], dict[str, Any]]
 """Of a block: tensors and JSON."""
@@ -166,23 +164,18 @@ class ParameterStore:
         header or state.
 
         Raises:
-            StoreError: too little space, found before anything of a mapping is written, or a write that
-                failed: the new files are gone, unless the disk refuses even to put the old manifest back;
-                `generation` tells.
+            StoreError: a write failed, as on a full disk: the new files are gone, unless the disk refuses
+                even to put the old manifest back; `generation` tells.
             TypeError, ValueError: something is not JSON.
         """
         self._require_writable()
         old = self._manifest
         generation = old.generation + 1
         with self._or_roll_back(f"Writing generation {generation} failed"):
-            if isinstance(updates, Mapping):
-                self._require_space(
-                    sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values())
-                )
-                updates = updates.items()
+            pairs = updates.items() if isinstance(updates, Mapping) else updates
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, meta)
-                for block, (tensors, meta) in updates
+                for block, (tensors, meta) in pairs
             }
             fsync_folder(self.folder)
             crash_points.reached(crash_points.SHARDS_IN_PLACE)
@@ -286,14 +279,6 @@ class ParameterStore:
     def _require_writable(self) -> None:
         if self._lock is None:
             raise StoreError(f"{self.folder} is open for reading; open it without `read_only` and `name`.")
-
-    def _require_space(self, needed: int) -> None:
-        free = shutil.disk_usage(self.folder).free
-        if needed > free:
-            raise StoreError(
-                f"{self.folder} has {bytes_in_words(free)} free but the next generation needs "
-                f"{bytes_in_words(needed)}. Free space and go on; generation {self.generation} is intact."
-            )
 
     def _publish(self, manifest: Manifest) -> None:
         """Make `manifest` the present one, on disk and here. Its shards must be on disk."""

@@ -2,9 +2,10 @@
 
 import itertools
 import math
+import threading
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
+from contextlib import suppress
 from itertools import accumulate, pairwise
 from typing import Any, Protocol, runtime_checkable
 
@@ -133,8 +134,8 @@ class StoredScene(VisitScene):
             blocks: on the CPU, by number or special name, and tables of the run's under names of their own;
                 they belong to the scene from now on, as `state` does.
             within: this is written so many seconds after the last write began. With 0 all is durable when
-                this returns, and also where what waits to be written exceeds `ram_bytes`; where that is the
-                live block, training goes on while it is written.
+                this returns, and also where what waits to be written exceeds `ram_bytes`, but for a live
+                block: training goes on while that is written.
 
         Raises:
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
@@ -156,9 +157,7 @@ class StoredScene(VisitScene):
             self._rested = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
         live = blocks.get(LIVE)
-        if within > 0 and live is not None and len(live) and unsaved > self.ram_bytes:
-            self._writer.begin()
-        elif within <= 0 or unsaved > self.ram_bytes:
+        if within <= 0 or (unsaved > self.ram_bytes and not live):
             self.flush()
         self._writer.check()
 
@@ -184,16 +183,10 @@ class StoredScene(VisitScene):
                         self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
 
-    def make_room(self) -> None:
-        """Before a copy of the live block is made: wait for the last, if that is large and unwritten."""
-        with self._writer.mutex:
-            unsaved = self.unsaved_bytes
-        if unsaved > self.ram_bytes:
-            self.flush()
-
     def is_due(self, within: float) -> bool:
-        """Whether something should be put to rest again: nothing was for so many seconds; 0 is no limit."""
-        return 0 < within <= time.monotonic() - self._rested
+        """Whether something should be put to rest again: nothing was for so many seconds, and nothing is
+        being written, so that RAM holds one copy of a large live block; 0 is no limit."""
+        return 0 < within <= time.monotonic() - self._rested and not self._writer.busy
 
     def flush(self) -> None:
         """Return when all that was put to rest is durable; what failed before is tried again. See `rest`."""
@@ -269,7 +262,11 @@ class StoredScene(VisitScene):
         """Have `state` of a block at hand soon; returns at once."""
         with self._writer.mutex:
             if block not in self._unsaved and self._memory.whole(block) is None:
-                self._writer.do(partial(self._packed, block, whole=True))
+                threading.Thread(target=self._try_to_read, args=(block,), daemon=True).start()
+
+    def _try_to_read(self, block: int) -> None:
+        with suppress(Exception):  # the caller that needs the block meets the error
+            self._packed(block, whole=True)
 
     def gaussians(self, block: int) -> Gaussians:
         if not self._is_live(block):

@@ -4,8 +4,8 @@ A thread does it, which lives as long as there is something to write and no long
 that ends takes it along, which is as if the process had been killed.
 
 Processes that train a block are forked from this one, and a thread does not live on in a fork. So a fork
-waits until the thread is between two jobs, and takes place with the lock held and free on both sides
-afterwards: no job, and nothing that a job holds within torch, the store or the C library, is ever cut in
+waits until the thread is between two writes, and takes place with the lock held and free on both sides
+afterwards: no write, and nothing that it holds within torch, the store or the C library, is ever cut in
 two. The child writes nothing, and reads no store: it was handed all blocks.
 """
 
@@ -15,9 +15,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from abcd_ns.engine.gaussians.packed import Packed
@@ -61,9 +59,9 @@ class WriteBehind:
         """The same, to wait with; for those who are not broken off."""
         self._waiting: Snapshot | None = None
         self._due, self._began = math.inf, time.monotonic()
-        self._chore: Callable[[], object] | None = None
         self._error: BaseException | None = None
-        self._busy = False
+        self.busy = False
+        """Whether a snapshot is being written."""
         self._thread: threading.Thread | None = None
         _all.add(self)
 
@@ -81,33 +79,17 @@ class WriteBehind:
             if error is not None:
                 raise error
 
-    def do(self, chore: Callable[[], object]) -> None:
-        """Do this on the thread as soon as it has nothing to write, instead of what was to be done so."""
-        with self.lock:
-            self._chore = chore
-            self._wake()
-
-    def begin(self) -> None:
-        """Return when all that waits is being written, or could not be."""
-        with self.lock:
-            self._hurry()
-            while self._error is None and self._waiting is not None:
-                self.lock.wait()
-
     def flush(self) -> None:
         """Write all that waits, and return when it is durable; what failed before is tried again. Raises as
         `check`."""
         with self.lock:
             self._error = None
-            self._hurry()
-            while self._error is None and (self._waiting is not None or self._busy):
+            if self._waiting is not None:
+                self._due = -math.inf
+                self._wake()
+            while self._error is None and (self._waiting is not None or self.busy):
                 self.lock.wait()
             self.check()
-
-    def _hurry(self) -> None:
-        if self._waiting is not None:
-            self._due = -math.inf
-            self._wake()
 
     def _wake(self) -> None:
         if self._thread is None:
@@ -116,34 +98,27 @@ class WriteBehind:
         self.lock.notify_all()
 
     def _run(self) -> None:
-        while (job := self._next_job()) is not None:
+        while (snapshot := self._next()) is not None:
             try:
-                job()
+                self._write(snapshot)
             finally:
-                del job  # what it has written need not stay until there is another
+                del snapshot  # what was written need not stay until there is another
                 with self.lock:
-                    self._busy = False
+                    self.busy = False
                     self.lock.notify_all()
 
-    def _next_job(self) -> Callable[[], object] | None:
-        """What is to be done next; waits for its time. None ends the thread."""
+    def _next(self) -> Snapshot | None:
+        """What is to be written next; waits for its time. None ends the thread."""
         with self.lock:
-            while True:
-                left = self._due - time.monotonic()
-                if self._waiting is not None and left <= 0:
-                    job = partial(self._write, self._waiting)
-                    self._waiting, self._due, self._began = None, math.inf, time.monotonic()
-                    self.lock.notify_all()
-                elif self._chore is not None:
-                    job, self._chore = partial(_try, self._chore), None
-                elif self._waiting is not None and left < math.inf:
+            while self._waiting is not None and (left := self._due - time.monotonic()) < math.inf:
+                if left > 0:
                     self.lock.wait(left)
                     continue
-                else:
-                    self._thread = None
-                    return None
-                self._busy = True
-                return job
+                snapshot, self._waiting = self._waiting, None
+                self._due, self._began, self.busy = math.inf, time.monotonic(), True
+                return snapshot
+            self._thread = None
+            return None
 
     def _write(self, snapshot: Snapshot) -> None:
         try:
@@ -157,11 +132,6 @@ class WriteBehind:
                 raise
 
 
-def _try(chore: Callable[[], object]) -> None:
-    with suppress(Exception):  # the caller that needs what it was for meets the error
-        chore()
-
-
 _all: "weakref.WeakSet[WriteBehind]" = weakref.WeakSet()
 _held: list[WriteBehind] = []
 
@@ -169,7 +139,7 @@ _held: list[WriteBehind] = []
 def _before_fork() -> None:
     for writer in sorted(_all, key=id):  # two threads that fork take the locks in the same order
         writer.lock.acquire()
-        while writer._busy:
+        while writer.busy:
             writer.lock.wait()
         _held.append(writer)
 

@@ -177,7 +177,6 @@ class Coordinator(Trainer):
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
-            self.scene.make_room()
             updates = {LIVE: self.visit.live.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:

@@ -1,4 +1,4 @@
-"""`abcd compare`: methods, numbers of blocks, prices, options and sizes under one protocol, a process each.
+"""`abcd compare`: methods, numbers of blocks, options and sizes under one protocol, a process each.
 
 `command` makes the plan; `charts` and `pictures` show what came of it.
 """

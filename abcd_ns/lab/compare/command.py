@@ -31,12 +31,11 @@ from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
-from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, parse_changes, words
+from abcd_ns.lab.runs.options import Flag, check_numbers, check_ranges, parse_changes, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
 
 PICTURES = "pictures"
-PRICE = "training.density.price"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +60,6 @@ class Options:
     """Divides the photos' width and height. Default: 1."""
     blocks: Annotated[tuple[int, ...] | None, words("N ...")] = None
     """Blocks of every method that has any; an arm for each of several numbers. Default: 8."""
-    prices: Annotated[tuple[float, ...] | None, words("PIXELS ...")] = None
-    """An arm for each: what a Gaussian must contribute to stay, see training.density.price."""
     vary: Annotated[tuple[str, ...] | None, words("NAME=VALUE ...")] = None
     """An arm for each change of an option. Names: `ns-train abcd --help`, under --pipeline. Several
     at once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
@@ -79,17 +76,13 @@ class Options:
     """Which views are not trained on: every 8th by name, or an eighth from one place. Default: interval."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
-    max_gaussians: Annotated[int | None, words("N")] = None
-    """In the whole scene; 0 for no limit. Default: 0."""
-    no_densify: Flag = False
-    """Train the initial Gaussians only: none are added or pruned."""
     pictures: Annotated[int | None, words("N")] = None
     """Held-out views to show. Default: 3."""
 
     @property
     def given(self) -> dict[str, Any]:
         """Those that were given, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None and value is not False}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def over(self, other: "Options") -> "Options":
         """These options, and `other`'s where these were not given."""
@@ -104,11 +97,9 @@ DEFAULTS = Options(
     seeds=(0,),
     downscale=1,
     blocks=(8,),
-    prices=(),
     vary=(),
     hold_out="interval",
     evals=8,
-    max_gaussians=0,
     pictures=3,
 )
 TERRAIN_DEFAULTS = Options(methods=("abcd",), seeds=(0,), tile_gaussians=20_000, visits=3)
@@ -126,17 +117,15 @@ def compare(
 ) -> int:
     """Train several arms on one scene under one protocol, and write what came of it.
 
-    Arms are methods, each with every number of blocks, and each as it is, with every price, and with every
-    change. Each run has a process of its own, one after the other. OUT gets results.json, table.md, charts of
-    PSNR over training time (speed_accuracy.png), PSNR over Gaussians (size_accuracy.png) and memory over
-    Gaussians (memory.png), and pictures of held-out views. Called again with the same OUT, it reuses the runs
-    that are finished, so that more seeds and arms may be added later.
+    Arms are methods, each with every number of blocks, and each as it is and with every change. Each run has
+    a process of its own, one after the other. OUT gets results.json, table.md, charts of PSNR over training
+    time (speed_accuracy.png), PSNR over Gaussians (size_accuracy.png) and memory over Gaussians (memory.png),
+    and pictures of held-out views. Called again with the same OUT, it reuses the runs that are finished, so
+    that more seeds and arms may be added later.
 
     abcd compare --data scene --seconds 60 --seeds 0 1 --out methods
 
     abcd compare --data scene --seconds 60 --methods abcd --blocks 1 2 4 8 16 27 --out blocks
-
-    abcd compare --data scene --seconds 60 --prices 0 1 4 16 64 --out prices
 
     abcd compare --data scene --seconds 60 --vary training.warmup=0 training.batch=1 --out options
 
@@ -183,7 +172,7 @@ def make_plan(options: Options) -> Plan:
     Raises:
         UserError: an option is missing, out of range or contradicts another.
     """
-    if len(options.blocks or ()) > 1 or {"prices", "vary"} & options.given.keys():
+    if len(options.blocks or ()) > 1 or options.vary:
         options = options.over(Options(methods=("abcd",)))
     given = options.over(DEFAULTS if options.tiles is None else TERRAIN_DEFAULTS)
     _check_methods(given)
@@ -208,12 +197,12 @@ def make_plan(options: Options) -> Plan:
 def _budgets_plan(given: Options, asked: Options) -> Plan:
     """The runs without a limit: what budgets are shares of, and ceilings."""
     shares_of(given.budgets)
-    if others := {"blocks", "prices", "vary", "max_gaussians"} & asked.given.keys():
-        raise UserError(f"--{min(others).replace('_', '-')} does not go with --budgets.")
+    if others := {"blocks", "vary"} & asked.given.keys():
+        raise UserError(f"--{min(others)} does not go with --budgets.")
     if others := set(given.methods) - {*WITHIN, *ALONE}:
         raise UserError(f"{min(others)} keeps to no budget: leave it out.")
     settings = dataclasses.replace(_settings(given), blocks=0)
-    command = _command(dataclasses.replace(given, blocks=None, prices=None, vary=None, max_gaussians=None))
+    command = _command(dataclasses.replace(given, blocks=None, vary=None))
     methods = [m for m in METHODS if m == JOINT or (m in ALONE and m in given.methods)]
     jobs = tuple(Job(method, seed, settings) for seed in given.seeds for method in methods)
     return Plan("comparison", settings, Path(given.out), jobs, command)
@@ -255,18 +244,15 @@ def terrain_jobs(
 
 
 def arms_of(given: Options) -> list[tuple[str, ...]]:
-    """What each arm changes: every number of blocks, if there are several, with nothing, each price, each of
+    """What each arm changes: every number of blocks, if there are several, with nothing and with each of
     --vary. A UserError where an option does not exist, or a value does not fit."""
     check_numbers("--blocks", given.blocks, 1)
-    for price in given.prices:
-        if not 0 <= price < math.inf:
-            raise UserError(f"--prices {price:g}: a price is 0 or more, in pixels.")
-    changes = [(f"{PRICE}={price:g}",) for price in given.prices]
+    changes: list[tuple[str, ...]] = []
     if given.vary:
         # Here and not above: `--help` has no use for nerfstudio.
         from abcd_ns.lab.runs.configs import registered
 
-        changes += [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
+        changes = [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
     of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]
     if twice := [one for one in changes if changes.count(one) > 1] + of_blocks:
@@ -317,7 +303,7 @@ def _settings(given: Options) -> Settings:
         raise UserError("Give each run's budget: either --seconds or --steps.")
     if given.seconds is not None and not 0 < given.seconds < math.inf:
         raise UserError(f"--seconds is {given.seconds}; it must be above 0 and finite.")
-    check_ranges({name: getattr(given, name) for name in LOWEST})
+    check_ranges({name: getattr(given, name) for name in ("downscale", "steps", "evals", "pictures")})
     if max(given.blocks, default=1) > MAX_BLOCKS:
         raise UserError(f"--blocks is {max(given.blocks)}; it must be at most {MAX_BLOCKS}.")
     return Settings(
@@ -327,8 +313,6 @@ def _settings(given: Options) -> Settings:
         seconds=given.seconds,
         steps=given.steps,
         evals=given.evals,
-        max_gaussians=given.max_gaussians,
-        densify=not given.no_densify,
         pictures=given.pictures,
         hold_out=given.hold_out,
     )
@@ -349,7 +333,7 @@ def _command(given: Options) -> str:
     for name, value in given.given.items():
         if name in ("data", "out"):
             value = scene_name(value)
-        values = [] if value is True else value if isinstance(value, tuple) else [value]
+        values = value if isinstance(value, tuple) else [value]
         texts = [f"{one:g}" if isinstance(one, float) else str(one) for one in values]
         line += [f"--{name.replace('_', '-')}", *texts] if value != () else []
     return shlex.join(line)

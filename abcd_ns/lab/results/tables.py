@@ -204,8 +204,6 @@ def _protocol(results: Results) -> str:
     conditions = [f"{budget} a run", seeds]
     if s.blocks and set(results.methods) != {"abcd-monolithic"}:
         conditions.append(f"{s.blocks} blocks")
-    conditions += [] if s.densify else ["the number of Gaussians fixed"]
-    conditions += [f"at most {s.max_gaussians:,} Gaussians"] if s.max_gaussians else []
     held_out = f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on"
     if s.hold_out == "sector":
         held_out = f"one view in {HELD_OUT_EVERY}, all from one place"

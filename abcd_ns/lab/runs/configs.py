@@ -75,9 +75,6 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
         training, steps = pipeline.training, -(-settings.steps // job.blocks)
         training.recipe = dataclasses.replace(training.recipe, visit_steps=steps)
     pipeline.max_seconds = settings.seconds
-    pipeline.training.density.max_gaussians = settings.max_gaussians
-    if not settings.densify:
-        pipeline.training.density.strategy = "off"
     change_options(pipeline, job.changes)
     if pipeline.gaussian_bytes:
         pipeline.workers = 1  # the budget is one device's
@@ -102,8 +99,6 @@ def _splatfacto(job: Job) -> TrainerConfig:
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     if job.method == "splatfacto-scaled":
         config = scaled(config, job.settings.steps)
-    if not job.settings.densify:
-        config.pipeline.model.stop_split_at = 0
     return config
 
 

@@ -77,8 +77,6 @@ def why_left_out(job: Job, outcome: Run | Failure | None = None) -> str | None:
             return f"{job.value} tiles have more than {MOST_IN_ONE_BLOCK:,} Gaussians"
         if isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
             return f"as one block, {job.value} tiles ran out of GPU memory"
-    if job.method.startswith("splatfacto") and job.settings.max_gaussians:
-        return "it has no limit on the number of Gaussians, and this protocol sets one"
     return None
 
 

@@ -1,4 +1,4 @@
 """The one procedural world: exact surfaces, and the pictures that cameras take of them; no Gaussian is in it.
 
-`world` has balls and walls for experiments, `court` the courts of `abcd synth`, `land` as much as one wants.
+`world` has balls and walls for experiments and `abcd demo`, `land` as much as one wants.
 """

@@ -54,7 +54,7 @@ def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: 
 def made_up_settings(**fields) -> Settings:
     """Those of a run of a minute."""
     values = {"data": "made-up", "downscale": 4, "blocks": 8, "seconds": 60.0, "steps": None, "evals": 6}
-    return Settings(**{**values, "max_gaussians": 0, "densify": True, "pictures": 3, **fields})
+    return Settings(**{**values, "pictures": 3, **fields})
 
 
 def made_up(kind: str, *arms: Arm, **fields) -> Results:

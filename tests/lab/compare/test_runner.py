@@ -13,7 +13,7 @@ from rich.console import Console
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
-from abcd_ns.lab.job import Job, Plan
+from abcd_ns.lab.job import Plan
 from abcd_ns.lab.results.records import encode
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs.runner import run_jobs
@@ -85,7 +85,7 @@ def test_a_failed_run_is_reported_and_the_others_go_on(plan, worker, behaviour, 
 def test_another_protocol_or_machine_is_refused_by_name_until_overwritten(plan, worker, monkeypatch):
     run(plan)
     worker.calls()
-    for field, value in (("steps", 11), ("blocks", 2), ("densify", False), ("data", "other")):
+    for field, value in (("steps", 11), ("blocks", 2), ("data", "other")):
         other = with_settings(plan, **{field: value})
         with pytest.raises(UserError, match=rf"holds runs with {field} .*, not {value}"):
             run(other)
@@ -147,16 +147,3 @@ def test_a_change_that_failed_is_named_and_all_is_written(plan, worker):
     assert "ValueError: the scene is empty" in text
     for name in ("speed_accuracy.png", "memory.png"):
         assert (plan.out / name).stat().st_size > 0
-
-
-def test_splatfacto_is_left_out_with_a_reason_where_gaussians_are_limited(plan, worker):
-    settings = dataclasses.replace(plan.settings, max_gaussians=9)
-    jobs = tuple(Job(method, 0, settings) for method in ("splatfacto", "splatfacto-scaled", "abcd"))
-    limited = dataclasses.replace(plan, jobs=jobs, settings=settings)
-    assert carry_out(limited, Console(file=StringIO())) == 0
-    assert worker.calls() == ["abcd"]
-    left = read_results(plan.out / "results.json").left_out
-    assert [(each.method, "limit" in each.reason) for each in left] == [
-        ("splatfacto", True),
-        ("splatfacto-scaled", True),
-    ]
