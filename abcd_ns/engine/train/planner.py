@@ -257,7 +257,7 @@ class Planner(Visits):
             views, slack = list(found.values()), self._run.rasterizer.slack
             self._culling = found, Frusta(((v, v.full) for v in views), slack), Optics(views, slack)
         _, frusta, optics = self._culling
-        (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
+        (shows,) = frusta.may_show(optics.drawn_within([bounds])).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 
     def _footprints(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
