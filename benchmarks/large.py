@@ -1,8 +1,8 @@
 """What a visit costs in a town of few blocks and in one of many: `python -m benchmarks.large --out FILE.json`.
 
-Blocks are of equal size. Cameras stand in the streets, buildings hide each other, hills are the horizon. Nothing
-is trained before: a visit's seconds and bytes do not depend on it. Pictures are small, and so is, in proportion,
-the room for layers while they are folded: views are drawn in such groups as on pictures of `modelled` pixels.
+Blocks are of equal size. Cameras stand in the streets, houses hide each other, hills are the horizon. Nothing is
+trained before: what a visit costs does not depend on it. Blocks and pictures are small. Gaussians are as large
+as those of a block of BLOCK; the room for layers and the tiles' slack are as on pictures `modelled` px wide.
 """
 
 import json
@@ -73,15 +73,15 @@ class Args:
 
     blocks: tuple[int, ...] = (8, 200)
     """Of each town."""
-    gaussians: int = 1000
+    gaussians: int = 300
     """Of a block."""
     views: int = 40
     """For each block."""
     most_views: int = 5000
     """Of a town."""
-    visits: int = 4
+    visits: int = 3
     """That are measured, after one that is not."""
-    width: int = 96
+    width: int = 192
     """Of a picture, px; its height is two thirds."""
     modelled: int = 1600
     """Width of the pictures that the room for layers is modelled on, px."""
@@ -127,7 +127,10 @@ class Town:
             self.points(), 255 * self._uniform(self.blocks * self.args.gaussians, 3)
         )
         rest = 0.02 * torch.randn(found.features_rest.shape, generator=self._random)
-        return replace(found, features_rest=rest, opacities=torch.full_like(found.opacities, 3.0))
+        scales = found.scales + math.log(self.args.gaussians / BLOCK) / 2
+        return replace(
+            found, scales=scales, features_rest=rest, opacities=torch.full_like(found.opacities, 3.0)
+        )
 
     def views(self) -> list[View]:
         """Along the streets, most of them looking that way."""
@@ -162,10 +165,11 @@ class Town:
 
 
 def options(blocks: int, args: Args) -> RunOptions:
-    """Of a run that does not grow, whose nodes are of two blocks, with a cache for some of them."""
+    """Of a run that does not grow, whose nodes are as a card holds them, with a cache for some of them."""
+    needs = needs_of(TrainingConfig(), args.modelled**2 * 2 // 3, blocks)
     training = TrainingConfig(
         recipe=Recipe(sh_ramp=0),
-        limits=Limits(pass_gaussians=2 * args.gaussians),
+        limits=Limits(pass_gaussians=needs.frozen_beside(BLOCK) * args.gaussians // BLOCK),
         warmup=0,
         batch=4,
         density=DensityConfig(max_gaussians=blocks * args.gaussians),
@@ -174,13 +178,35 @@ def options(blocks: int, args: Args) -> RunOptions:
     return RunOptions(training, blocks=blocks, workers=1, ram_budget_gb=ram)
 
 
+class Small(TorchRasterizer):
+    """Reaches as far around as a card's tiles do on pictures `times` as large."""
+
+    def __init__(self, times: float) -> None:
+        super().__init__()
+        self._slack = (self.primitive.blur_pixels + 16 / math.sqrt(2)) / times
+
+    @property
+    def slack(self) -> float:
+        """See Rasterizer."""
+        return self._slack
+
+
 def begin(town: Town, folder: Path, start: Start | None = None) -> Coordinator:
     """A run that begins, or resumes."""
     views, device = town.views(), torch.device("cpu")
     names = [Path(str(view.index)) for view in views]
-    capture = Capture(views, names, lambda sample: None, town.gaussians, town.blocks * town.args.gaussians)
+    args = town.args
+    capture = Capture(views, names, lambda _: None, town.gaussians, town.blocks * args.gaussians)
     live, budget = nothing_live(3), Budget(steps=10**7)
-    run = options(town.blocks, town.args), capture, device, folder, budget, TorchRasterizer(), *live
+    run = (
+        options(town.blocks, town.args),
+        capture,
+        device,
+        folder,
+        budget,
+        Small(args.modelled / args.width),
+        *live,
+    )
     return begin_run(*run, lambda _: None, None, start)
 
 
@@ -198,6 +224,7 @@ class Counts:
 
     def __init__(self, coordinator: Coordinator) -> None:
         self.clock, self.peak, self.numbers = StageClock(), 0, Counter[str]()
+        self._process = psutil.Process()
         timed = self.clock.timed
         ParameterStore.load = self._noted(timed("reading", ParameterStore.load), self._read)
         LayerRenderer.load = self._noted(timed("loading", LayerRenderer.load), self._loaded)
@@ -212,7 +239,7 @@ class Counts:
         def call(*args: Any, **more: Any) -> Any:
             result = function(*args, **more)
             note(result, *args)
-            self.peak = max(self.peak, psutil.Process().memory_info().rss)
+            self.peak = max(self.peak, self._process.memory_info().rss)
             return result
 
         return call
@@ -233,8 +260,7 @@ class Counts:
 def measure(blocks: int, args: Args, folder: Path) -> dict[str, float]:
     """Of one visit: the mean of some."""
     coordinator = begin(Town(blocks, args), folder, Start(folder, None, 0))
-    height = args.modelled * 2 // 3
-    needs = needs_of(coordinator.config, args.modelled * height, blocks)
+    needs = needs_of(coordinator.config, args.modelled**2 * 2 // 3, blocks)
     layer_source.PARTS_BYTES = int(needs.parts_bytes * (args.width / args.modelled) ** 2)
     grey, counts, visits = torch.full((1, 1, 3), 0.5), Counts(coordinator), 0
     while visits <= args.visits:
@@ -260,8 +286,8 @@ def measure(blocks: int, args: Args, folder: Path) -> dict[str, float]:
 
 
 def modelled(found: dict[str, float], batch: int, args: Args) -> dict[str, float]:
-    """The same visit to blocks of BLOCK Gaussians on pictures of `args.modelled` px, by the rates of a card; what
-    lies between in Python as it was measured here."""
+    """The same visit to blocks of BLOCK Gaussians on pictures `args.modelled` px wide, by the rates of a card;
+    what is done between in Python as measured here."""
     more, larger = BLOCK / args.gaussians, (args.modelled / args.width) ** 2
     layers = found["s loading"] + found["s folding, and Python"]
     layers += more * (found["MB read"] * 1e6 / DISK + found["Gaussians loaded"] * PARAMETERS / BUS)

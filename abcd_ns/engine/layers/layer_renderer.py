@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from cachetools import LRUCache, cached
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
@@ -19,7 +19,7 @@ from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, shared
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
-from abcd_ns.engine.space.visibility import reaches
+from abcd_ns.engine.space.visibility import reaches, straddles
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
@@ -29,6 +29,8 @@ PARTS_BYTES = 256 << 20
 is more room for them. Each group of views that has room loads the nodes that it sees once."""
 BYTES_PER_PIXEL = 32
 """Of a front and a back layer in float32, or of one with its depth."""
+STRADDLERS_BYTES = 256 << 20
+"""Of Gaussians that reach from their blocks into others, kept while these are loaded."""
 LEAST_PASS = 200_000
 """Gaussians: so many are drawn in one pass wherever blocks are small."""
 
@@ -78,8 +80,8 @@ class Shown:
     """By fragments, of the blocks elsewhere that may reach into it."""
     crops: dict[int, Crop]
     """The part of each crop that may show something, by the view's index."""
-    reach: Callable[[Tensor, Tensor], Tensor]
-    """Which Gaussians, by means and scales, some view may see inside the node, [n]."""
+    straddlers: Callable[[int], Gaussians]
+    """Of another block, the Gaussians that some view may see inside the node; on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ class LayerRenderer:
         bounds = {b: self.scene.bounds(b) for b in range(self.tree.num_blocks) if b != exclude}
         bounds = {block: box for block, box in bounds.items() if box is not None}
         blocks, boxes = torch.tensor(list(bounds)), optics.drawn_within(list(bounds.values()))
-        found = {}
+        cache = LRUCache(STRADDLERS_BYTES, getsizeof=lambda gaussians: gaussians.nbytes)
+        straddlers, found = cached(cache)(partial(self._straddlers, optics)), {}
         for node in nodes:
             leaves, space = self.tree.leaves(node), self.tree.box(node)
             meets, parts = shared(boxes, space)
@@ -154,21 +157,28 @@ class LayerRenderer:
             own = [block for block in leaves if block in some]
             if is_by_means:
                 crops = {view.index: crop for view, crop in seen if view.index in crops}
-            reach = partial(self._reach, space, optics)
-            found[node] = Shown(own, [block for block in some if block not in own], crops, reach)
+            others = [block for block in some if block not in own]
+            found[node] = Shown(own, others, crops, partial(self._reach_in, space, optics, straddlers))
         return found
 
     def load(self, shown: Shown) -> Loaded:
         """On the device: what may show of a node's blocks and, by fragments, of all others that reach in."""
         parts = [self.scene.drawn(block, self.device) for block in shown.own]
         own = sum(map(len, parts))
-        parts += [self.scene.drawn(block, self.device, shown.reach) for block in shown.others]
+        parts += [shown.straddlers(block).to(self.device) for block in shown.others]
         gaussians = Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device)
         return Loaded(gaussians, own, shown.crops)
 
+    def _straddlers(self, optics: Optics, block: int) -> Gaussians:
+        """A block's Gaussians that some view may see outside its cell."""
+        cell = self.tree.cell(block)
+        which = lambda *shapes: straddles(*shapes, cell, optics.slack(shapes[0]), optics.slant)  # noqa: E731
+        return self.scene.drawn(block, "cpu", which)
+
     @staticmethod
-    def _reach(box: Box, optics: Optics, means: Tensor, scales: Tensor) -> Tensor:
-        return reaches(means, scales, box, optics.slack(means), optics.slant)
+    def _reach_in(box: Box, optics: Optics, straddlers: Callable[[int], Gaussians], block: int) -> Gaussians:
+        found = straddlers(block)
+        return found[reaches(found.means, found.scales, box, optics.slack(found.means), optics.slant)]
 
     def render(
         self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings, active: int

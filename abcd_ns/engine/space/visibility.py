@@ -72,6 +72,18 @@ def reaches(
     return outside.norm(dim=1) <= slant * reach_radius(scales) + slack
 
 
+def straddles(
+    means: Float[Tensor, "n 3"],
+    scales: Float[Tensor, "n 3"],
+    box: Box,
+    slack: Float[Tensor, "n"],
+    slant: float,
+) -> Bool[Tensor, "n"]:
+    """Whether any fragment of each Gaussian may lie outside `box`; see `reaches`."""
+    inside = torch.minimum(means - box.lower.to(means), box.upper.to(means) - means).amin(dim=1)
+    return ~(inside > slant * reach_radius(scales) + slack)
+
+
 def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:
     """(first pixel, number of pixels) of [low, high] grown, aligned outward and clipped to 0 .. size."""
     start = (math.floor(max(low, 0.0)) - margin) // align * align
