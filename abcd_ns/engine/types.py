@@ -112,30 +112,27 @@ class Crop(NamedTuple):
     def pixels(self) -> int:
         return self.width * self.height
 
-    @property
-    def right(self) -> int:
-        """The first column beyond it."""
-        return self.x + self.width
-
-    @property
-    def bottom(self) -> int:
-        """The first row below it."""
-        return self.y + self.height
-
     def enlarged(self, by: int) -> "Crop":
         """The same part of an image that is `by` times as wide and as high."""
         return Crop(self.x * by, self.y * by, self.width * by, self.height * by)
 
-    def shared(self, other: "Crop") -> "Crop | None":
-        """The pixels of both; None where there are none."""
-        x, y = max(self.x, other.x), max(self.y, other.y)
-        width, height = min(self.right, other.right) - x, min(self.bottom, other.bottom) - y
-        return Crop(x, y, width, height) if min(width, height) > 0 else None
-
     def joined(self, other: "Crop") -> "Crop":
         """The least crop that holds both."""
         x, y = min(self.x, other.x), min(self.y, other.y)
-        return Crop(x, y, max(self.right, other.right) - x, max(self.bottom, other.bottom) - y)
+        right, bottom = (
+            max(a.x + a.width for a in (self, other)),
+            max(a.y + a.height for a in (self, other)),
+        )
+        return Crop(x, y, right - x, bottom - y)
+
+    def shared(self, other: "Crop") -> "Crop | None":
+        """The pixels of both; None where there are none."""
+        x, y = max(self.x, other.x), max(self.y, other.y)
+        right, bottom = (
+            min(a.x + a.width for a in (self, other)),
+            min(a.y + a.height for a in (self, other)),
+        )
+        return Crop(x, y, right - x, bottom - y) if x < right and y < bottom else None
 
     def within(self, outer: "Crop") -> "Crop":
         """The same pixels, counted from the upper left corner of `outer`."""

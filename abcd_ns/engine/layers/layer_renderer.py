@@ -315,27 +315,16 @@ def drawn_over(front: Raster, behind: Raster) -> Raster:
 
 
 def _over(front: FrozenLayers, behind: FrozenLayers) -> FrozenLayers:
-    """The parts of two nodes as one, `front` being the nearer. The larger one is written to."""
+    """The parts of two nodes as one, `front` being the nearer."""
     inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
     crop = front.crop.joined(behind.crop)
-    if crop != behind.crop:
-        front = _widened(front, crop)
-    sides = ((front.front, behind.front), (front.back, behind.back))
-    layers = (_over_in_part(near, front.crop, far, behind.crop) for near, far in sides)
-    return FrozenLayers(*layers, Splats(torch.cat(inside, dim=1)) if inside else None, crop)
-
-
-def _over_in_part(near: Layer, of_near: Crop, far: Layer, of_far: Crop) -> Layer:
-    """`over` of two layers, the crop of one of them within the other's: there alone either hides anything."""
-    if of_near == of_far:
-        return over(near, far)
-    (whole, outer), (_, inner) = sorted(((near, of_near), (far, of_far)), key=lambda one: -one[1].pixels)
-    at = inner.within(outer).slices
-    part = Layer(whole.color[at], whole.transmittance[at])
-    folded = over(part, far) if whole is near else over(near, part)
-    part.color.copy_(folded.color)
-    part.transmittance.copy_(folded.transmittance)
-    return whole
+    front, behind = _widened(front, crop), _widened(behind, crop)
+    return FrozenLayers(
+        over(front.front, behind.front),
+        over(front.back, behind.back),
+        Splats(torch.cat(inside, dim=1)) if inside else None,
+        crop,
+    )
 
 
 def _widened(part: FrozenLayers, crop: Crop) -> FrozenLayers:
