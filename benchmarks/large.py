@@ -1,8 +1,10 @@
-"""What a visit costs in a town of few blocks and in one of many: `python -m benchmarks.large --out FILE.json`.
+"""What a visit costs in a town of few blocks and in one of many.
 
-Blocks are of equal size. Cameras stand in the streets, houses hide each other, hills are the horizon. Nothing is
-trained before: what a visit costs does not depend on it. Blocks and pictures are small. Gaussians are as large
-as those of a block of BLOCK; the room for layers and the tiles' slack are as on pictures `modelled` px wide.
+    python -m benchmarks.large --out FILE.json
+
+Blocks are of equal size. Cameras stand in the streets, houses hide each other, hills are the horizon. Nothing
+is trained before: what a visit costs does not depend on it. Blocks and pictures are small. Gaussians are as
+large as in a block of BLOCK. Room for layers and the tiles' slack are as on pictures `modelled` px wide.
 """
 
 import json
@@ -33,7 +35,7 @@ from abcd_ns.engine.train import layer_source, visit_training
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import needs_of
+from abcd_ns.engine.train.memory import LAYER_SHARE, needs_of
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
@@ -57,6 +59,8 @@ PARAMETERS = 236
 """Bytes of a Gaussian."""
 STAGES = ("plan", "reading", "loading", "drawing", "folding, and Python", "steps", "commit")
 """Of a visit; the middle four are its layers."""
+CARD = 24 << 30
+"""Bytes of the card in the model."""
 BLOCK = 250_000
 """Gaussians of a block in the model."""
 DISK, BUS = 2e9, 12e9
@@ -75,7 +79,7 @@ class Args:
     """Of each town."""
     gaussians: int = 300
     """Of a block."""
-    views: int = 40
+    views: int = 25
     """For each block."""
     most_views: int = 5000
     """Of a town."""
@@ -261,7 +265,10 @@ def measure(blocks: int, args: Args, folder: Path) -> dict[str, float]:
     """Of one visit: the mean of some."""
     coordinator = begin(Town(blocks, args), folder, Start(folder, None, 0))
     needs = needs_of(coordinator.config, args.modelled**2 * 2 // 3, blocks)
-    layer_source.PARTS_BYTES = int(needs.parts_bytes * (args.width / args.modelled) ** 2)
+    smaller = (args.width / args.modelled) ** 2
+    layer_source.PARTS_BYTES = int(smaller * needs.parts_bytes)
+    room = layer_source.LayerRoom(int(smaller * LAYER_SHARE * CARD))
+    coordinator.visit = visit_training.VisitTraining(coordinator.run, coordinator.visits, room)
     grey, counts, visits = torch.full((1, 1, 3), 0.5), Counts(coordinator), 0
     while visits <= args.visits:
         with counts.clock.stage("steps"):
@@ -286,8 +293,8 @@ def measure(blocks: int, args: Args, folder: Path) -> dict[str, float]:
 
 
 def modelled(found: dict[str, float], batch: int, args: Args) -> dict[str, float]:
-    """The same visit to blocks of BLOCK Gaussians on pictures `args.modelled` px wide, by the rates of a card;
-    what is done between in Python as measured here."""
+    """At blocks of BLOCK Gaussians and pictures `args.modelled` px wide, by the rates of a card. What
+    Python does between is as measured here."""
     more, larger = BLOCK / args.gaussians, (args.modelled / args.width) ** 2
     layers = found["s loading"] + found["s folding, and Python"]
     layers += more * (found["MB read"] * 1e6 / DISK + found["Gaussians loaded"] * PARAMETERS / BUS)
