@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS
-from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.space.tree import Box, in_float64
 from abcd_ns.engine.types import Crop, View
 
 
@@ -45,7 +45,7 @@ def widest_slant(views: Sequence[View]) -> float:
     (dx, dy, dz) lands at (dx - dz x/z, dy - dz y/z), longer by sqrt(1 + (x/z)^2 + (y/z)^2) at most. gsplat
     clamps x/z at the image's border plus 0.15 of its width (0.3 tan of half the field of view); y/z alike.
     """
-    K = torch.stack([view.K for view in views]).double().cpu()
+    K = in_float64(torch.stack([view.K for view in views])).cpu()
     size = torch.tensor([(view.width, view.height) for view in views], dtype=torch.float64)
     middle, focal = K[:, :2, 2], K[:, :2, :2].diagonal(dim1=1, dim2=2)
     limits = (torch.maximum(middle, size - middle) + 0.15 * size) / focal
