@@ -126,6 +126,24 @@ class Crop(NamedTuple):
         """The same part of an image that is `by` times as wide and as high."""
         return Crop(self.x * by, self.y * by, self.width * by, self.height * by)
 
+    def joined(self, other: "Crop") -> "Crop":
+        """The least crop that holds both."""
+        x, y = min(self.x, other.x), min(self.y, other.y)
+        right, bottom = (
+            max(a.x + a.width for a in (self, other)),
+            max(a.y + a.height for a in (self, other)),
+        )
+        return Crop(x, y, right - x, bottom - y)
+
+    def shared(self, other: "Crop") -> "Crop | None":
+        """The pixels of both; None where there are none."""
+        x, y = max(self.x, other.x), max(self.y, other.y)
+        right, bottom = (
+            min(a.x + a.width for a in (self, other)),
+            min(a.y + a.height for a in (self, other)),
+        )
+        return Crop(x, y, right - x, bottom - y) if x < right and y < bottom else None
+
     def within(self, outer: "Crop") -> "Crop":
         """The same pixels, counted from the upper left corner of `outer`."""
         return Crop(self.x - outer.x, self.y - outer.y, self.width, self.height)

@@ -308,7 +308,6 @@ class AbcdModel(SplatfactoModel):
         most = min(default_pass(scene), self._most_at_once())
         renderer = LayerRenderer(
             scene,
-            [view],
             self.draws_with(),
             ownership=ownership,
             pass_gaussians=most if pass_gaussians is None else pass_gaussians,

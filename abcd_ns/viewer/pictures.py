@@ -134,12 +134,11 @@ class BlockPictures:
 
     def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
         renderer, view = self.renderer, self.view
-        seen_by, seen = renderer.frusta([(view, view.full)]), [Seen(view, view.full, window)]
-        parts: dict[int, FrozenLayers | None] = {}
-        for node in renderer.nodes(exclude=block):
-            loaded = renderer.load(node, seen_by, exclude=block)
-            (parts[node],) = renderer.render(node, loaded, seen, self.settings, block)
-            renderer.fold_up(parts, node, view)
+        seen, parts = Seen(view, view.full, window), dict[int, FrozenLayers | None]()
+        nodes = renderer.nodes(exclude=block)
+        for node, shown in renderer.shown(nodes, [(view, view.full)], exclude=block).items():
+            (parts[node],) = renderer.render(node, renderer.load(shown), [seen], self.settings, block)
+            renderer.fold_up(parts, node, seen)
         return renderer.fold(parts, view, view.full)
 
 

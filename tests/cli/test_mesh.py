@@ -67,7 +67,7 @@ def maps(request, tmp_path_factory) -> DepthMaps:
     """The sphere from around it, drawn from two blocks, one after the other."""
     scene, views = sphere(), ring_of_views(8, width=96, height=72)
     parted = MemoryScene(build_kd(scene.means, 2), scene)
-    renderer = LayerRenderer(parted, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
+    renderer = LayerRenderer(parted, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
     assert len(renderer.nodes()) == 2
     settings = RenderSettings(sh_degree=3)
     median = None if request.param == "expected" else partial(median_depth, renderer, settings=settings)
@@ -127,7 +127,7 @@ def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
     scene, views = sphere(), maps.views[:2]
     scene.opacities[:] = -5.0
     whole = MemoryScene(build_kd(scene.means, 1), scene)
-    renderer = LayerRenderer(whole, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
+    renderer = LayerRenderer(whole, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
     faint = DepthMaps(tmp_path)
     faint.draw(WholePictures(renderer, RenderSettings(sh_degree=3)), views, lambda: None)
     assert not len(faint.footprints())

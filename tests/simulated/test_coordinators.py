@@ -65,7 +65,7 @@ def test_blocks_are_trained(on_device, start, photos, blocks, steps, options):
 def test_a_picture_is_composited(on_device, views):
     coordinator = on_device(blocks=4, steps=2, ownership="fragments")
     draws, scene = coordinator.run.rasterizer, coordinator.scene
-    renderer = LayerRenderer(scene, views, draws, ownership="fragments", pass_gaussians=0, device=DEVICE)
+    renderer = LayerRenderer(scene, draws, ownership="fragments", pass_gaussians=0, device=DEVICE)
     layer = renderer.picture(views[0], RenderSettings(1, False))
     assert layer.color.device == DEVICE
     merged = TorchRasterizer(use_native=False)(whole_scene(coordinator), views[0], sh_degree=1)

@@ -34,7 +34,7 @@ TREE = build_kd(GAUSSIANS.means, 6)
 
 def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, window_weight=0.0):
     scene = scene or MemoryScene(tree, GAUSSIANS)
-    renderer = LayerRenderer(scene, [VIEW], DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
+    renderer = LayerRenderer(scene, DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
     return BlockPictures(renderer, VIEW, SETTINGS, window_weight)
 
 

@@ -161,7 +161,6 @@ def _seen(
     room = int(FREE_SHARE * free_bytes(device)) // of_each
     renderer = LayerRenderer(
         scene,
-        views,
         make_rasterizer(config.model.rasterizer, device, primitive=config.training.primitive),
         ownership="fragments",
         pass_gaussians=min(default_pass(scene), room),

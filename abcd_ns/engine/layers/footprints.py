@@ -9,6 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.space.culling import CROP_ALIGN
 from abcd_ns.engine.space.influence import COARSE_SIDE, coarser, in_passes
 from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
@@ -16,8 +17,6 @@ from abcd_ns.engine.types import Crop, Gaussians, View
 
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
-CROP_ALIGN = 16
-"""Crops begin and end on multiples of so many pixels, or at the image's edge."""
 
 
 @dataclass(frozen=True)

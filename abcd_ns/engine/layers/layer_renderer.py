@@ -5,31 +5,32 @@ block tree, drawn from all Gaussians that reach into it, so that folding layers 
 With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
+from cachetools import LRUCache, cached
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.space.culling import Frusta, Optics
+from abcd_ns.engine.space.culling import Frusta, Optics, shared
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
-from abcd_ns.engine.space.visibility import reaches
+from abcd_ns.engine.space.visibility import reaches, straddles
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 Ownership = Literal["fragments", "means"]
 PARTS_BYTES = 256 << 20
 """Size of the layers held while nodes are folded, at most, unless those of a single view are larger, or there
-is more room for them. Each group of views that has room loads the scene once."""
+is more room for them. Each group of views that has room loads the nodes that it sees once."""
 BYTES_PER_PIXEL = 32
 """Of a front and a back layer in float32, or of one with its depth."""
+STRADDLERS_BYTES = 256 << 20
+"""Of Gaussians that reach from their blocks into others, kept while these are loaded."""
 LEAST_PASS = 200_000
 """Gaussians: so many are drawn in one pass wherever blocks are small."""
 
@@ -50,6 +51,8 @@ class FrozenLayers:
     back: Layer
     inside: Splats | None = None
     """The node's own Gaussians that have fragments in the window, if there are any; None by means."""
+    crop: Crop | None = None
+    """The pixels of the layers, which are empty elsewhere; None where these are known."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,25 @@ class Seen:
     window: ZWindow | None = None
     """Of the active block, by fragments: what lies in it is drawn neither in front nor behind."""
 
+    @cached_property
+    def center(self) -> list[float]:
+        """Of the camera, world space."""
+        return self.view.center.double().tolist()
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What some crops may show of a node, by bounds alone: what they do not is neither read nor drawn."""
+
+    own: list[int]
+    """Of its blocks, in the tree's order."""
+    others: list[int]
+    """By fragments, of the blocks elsewhere that may reach into it."""
+    crops: dict[int, Crop]
+    """The part of each crop that may show something, by the view's index."""
+    straddlers: Callable[[int], Gaussians]
+    """Of another block, the Gaussians that some view may see inside the node; on the CPU."""
+
 
 @dataclass(frozen=True)
 class Loaded:
@@ -70,12 +92,12 @@ class Loaded:
     """Its own, then those of other nodes that reach into it."""
     own: int
     """How many are its own."""
-    seen: frozenset[int]
-    """Indices of the views that may see something of the node."""
+    crops: dict[int, Crop]
+    """See Shown."""
 
     def shows_in(self, view: View) -> bool:
         """Whether `view` may see something of the node; False is certain."""
-        return len(self.gaussians) > 0 and view.index in self.seen
+        return len(self.gaussians) > 0 and view.index in self.crops
 
 
 class LayerRenderer:
@@ -83,7 +105,6 @@ class LayerRenderer:
 
     Args:
         scene: where Gaussians are read from.
-        views: all views that will be drawn; they bound how far Gaussians reach.
         pass_gaussians: the most Gaussians that one drawing may take on the device. A node of the tree
             that holds more is drawn in parts, down to single blocks.
     """
@@ -91,7 +112,6 @@ class LayerRenderer:
     def __init__(
         self,
         scene: BlockScene,
-        views: list[View],
         rasterizer: Rasterizer,
         *,
         ownership: Ownership,
@@ -103,16 +123,10 @@ class LayerRenderer:
         self.ownership = ownership
         self.device = torch.device(device)
         self._pass_gaussians = pass_gaussians
-        self._optics = Optics(views, rasterizer.slack)
-        self._drawn: dict[int, tuple[Box | None, Tensor | None]] = {}
 
     @property
     def tree(self) -> BlockTree:
         return self.scene.tree
-
-    def frusta(self, seen: Iterable[tuple[View, Crop]]) -> Frusta:
-        """What crops look at, for `load`."""
-        return Frusta(seen, self.rasterizer.slack)
 
     def nodes(self, exclude: int | None = None) -> tuple[int, ...]:
         """Nodes of the tree that tile space and hold every block but `exclude`, each to be drawn in one pass.
@@ -122,57 +136,49 @@ class LayerRenderer:
         """
         return tuple(self._descend(0, exclude))
 
-    def depth_of(self, node: int) -> int:
-        """How many nodes are above a node."""
-        depth = 0
-        while node:
-            node, depth = int(self.tree.parent[node]), depth + 1
-        return depth
+    def shown(
+        self, nodes: Iterable[int], seen: Sequence[tuple[View, Crop]], exclude: int | None = None
+    ) -> dict[int, Shown]:
+        """What these crops may show of each node, by the bounds of all blocks; nothing of `exclude`."""
+        slack, is_by_means = self.rasterizer.slack, self.ownership == "means"
+        frusta, optics = Frusta(seen, slack), Optics([view for view, _ in seen], slack)
+        bounds = {b: self.scene.bounds(b) for b in range(self.tree.num_blocks) if b != exclude}
+        bounds = {block: box for block, box in bounds.items() if box is not None}
+        blocks, boxes = torch.tensor(list(bounds)), optics.drawn_within(list(bounds.values()))
+        cache = LRUCache(STRADDLERS_BYTES, getsizeof=lambda gaussians: gaussians.nbytes)
+        straddlers, found = cached(cache)(partial(self._straddlers, optics)), {}
+        for node in nodes:
+            leaves, space = self.tree.leaves(node), self.tree.box(node)
+            meets, parts = shared(boxes, space)
+            if is_by_means:
+                meets, parts = torch.isin(blocks, torch.tensor(leaves)), boxes
+            shows, crops = frusta.crops(parts[meets])
+            some = blocks[meets][shows.any(dim=1)].tolist()
+            own = [block for block in leaves if block in some]
+            if is_by_means:
+                crops = {view.index: crop for view, crop in seen if view.index in crops}
+            others = [block for block in some if block not in own]
+            found[node] = Shown(own, others, crops, partial(self._reach_in, space, optics, straddlers))
+        return found
 
-    def load(self, node: int, seen_by: Frusta, exclude: int | None = None) -> Loaded:
-        """On the device: the Gaussians of the node's blocks and, by fragments, all others that reach in.
+    def load(self, shown: Shown) -> Loaded:
+        """On the device: what may show of a node's blocks and, by fragments, of all others that reach in."""
+        parts = [self.scene.drawn(block, self.device) for block in shown.own]
+        own = sum(map(len, parts))
+        parts += [shown.straddlers(block).to(self.device) for block in shown.others]
+        gaussians = Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device)
+        return Loaded(gaussians, own, shown.crops)
 
-        Args:
-            seen_by: keep to blocks of which something may show in these crops; others are not even read.
-        """
-        inside = [b for b in self.tree.leaves(node) if b != exclude]
-        outside: list[int] = []
-        if self.ownership == "fragments" and node != 0:
-            outside = [b for b in range(self.tree.num_blocks) if b not in set(inside) and b != exclude]
-        shown = self._shown(node, [*inside, *outside], seen_by)
-        inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
-        views = (view for k, (view, _) in enumerate(seen_by.seen) if any(row[k] for row in shown.values()))
-        parts = [self.scene.drawn(block, self.device) for block in inside]
-        own, box = sum(map(len, parts)), self.tree.box(node)
-        parts += [self.scene.drawn(block, self.device, partial(self._reach, box)) for block in outside]
-        return Loaded(
-            Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device),
-            own,
-            frozenset(view.index for view in views),
-        )
+    def _straddlers(self, optics: Optics, block: int) -> Gaussians:
+        """A block's Gaussians that some view may see outside its cell."""
+        cell = self.tree.cell(block)
+        which = lambda *shapes: straddles(*shapes, cell, optics.slack(shapes[0]), optics.slant)  # noqa: E731
+        return self.scene.drawn(block, "cpu", which)
 
-    def _shown(self, node: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
-        """Of these blocks, those with fragments in the node that some crop may show, and which crops."""
-        boxes = {b: box for b in blocks if (box := self._drawn_within(b)) is not None}
-        if self.ownership == "fragments" and boxes:
-            space, lower, upper = self.tree.box(node), *torch.stack(list(boxes.values())).unbind(1)
-            shared = torch.stack((lower.maximum(space.lower), upper.minimum(space.upper)), dim=1)
-            meets = (shared[:, 0] <= shared[:, 1]).all(dim=1).tolist()
-            boxes = {b: box for b, box, meet in zip(boxes, shared, meets, strict=True) if meet}
-        rows = seen_by.may_show([Box(*box) for box in boxes.values()]).tolist()
-        return {b: row for b, row in zip(boxes, rows, strict=True) if any(row)}
-
-    def _drawn_within(self, block: int) -> Float64[Tensor, "2 3"] | None:
-        """Corners of the box that a block's fragments lie in; kept while its bounds are."""
-        bounds = self.scene.bounds(block)
-        if block not in self._drawn or self._drawn[block][0] is not bounds:
-            box = None if bounds is None else self._optics.drawn_within(bounds)
-            self._drawn[block] = bounds, None if box is None else torch.stack((box.lower, box.upper))
-        return self._drawn[block][1]
-
-    def _reach(self, box: Box, means: Tensor, scales: Tensor) -> Tensor:
-        """Which Gaussians some view may see inside a box, [n]."""
-        return reaches(means, scales, box, self._optics.slack(means), self._optics.slant)
+    @staticmethod
+    def _reach_in(box: Box, optics: Optics, straddlers: Callable[[int], Gaussians], block: int) -> Gaussians:
+        found = straddlers(block)
+        return found[reaches(found.means, found.scales, box, optics.slack(found.means), optics.slant)]
 
     def render(
         self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings, active: int
@@ -191,16 +197,17 @@ class LayerRenderer:
     def _cut(
         self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings
     ) -> Iterator[FrozenLayers]:
-        spans = (self.span(node, one.view, one.crop) for one in seen)
-        shots = [
-            CutShot(one.view, one.crop, span.before(one.window), one.window, span.behind(one.window))
-            for one, span in zip(seen, spans, strict=True)
-        ]
+        shots = []
+        for one in seen:
+            crop = loaded.crops[one.view.index]
+            span, window = self.span(node, one.view, crop), one.window.on(self.rasterizer.window_grid(crop))
+            shots.append(CutShot(one.view, crop, span.before(window), window, span.behind(window)))
         others = loaded.own < len(loaded.gaussians)
-        for cut in self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings)):
+        cuts = self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings))
+        for cut, shot in zip(cuts, shots, strict=True):
             # What reaches in from another node is inside that one's.
             own = cut.inside[torch.where(cut.kept_ids < loaded.own)[0]] if others else cut.inside
-            yield FrozenLayers(cut.front, cut.back, own)
+            yield FrozenLayers(cut.front, cut.back, own, shot.crop)
 
     @torch.no_grad()
     def _put_whole(
@@ -210,7 +217,8 @@ class LayerRenderer:
             layer = self.rasterizer(loaded.gaussians, one.view, crop=one.crop, **vars(settings)).layer
             nothing = self._nothing(one.view, one.crop)
             is_front = self.order((node, self.tree.node_of(active)), one.view)[0] == node
-            yield FrozenLayers(layer, nothing) if is_front else FrozenLayers(nothing, layer)
+            front, back = (layer, nothing) if is_front else (nothing, layer)
+            yield FrozenLayers(front, back, crop=one.crop)
 
     def raster(self, node: int, gaussians: Gaussians, view: View, settings: RenderSettings) -> Raster:
         """All that a view sees of a node, by fragments what lies within it; differentiable."""
@@ -233,28 +241,33 @@ class LayerRenderer:
         wanted, center = set(nodes), view.center.double().cpu()
         return tuple(node for node in nodes_in_order(self.tree, center) if node in wanted)
 
-    def fold_up(self, parts: dict[int, FrozenLayers | None], node: int, view: View) -> None:
+    def fold_up(
+        self, parts: dict[int, Any], node: int, seen: Seen, fold: Callable[[Any, Any], Any] | None = None
+    ) -> None:
         """Collapse what has come in with `node` and its neighbours in the tree, in place, as far as it goes.
 
         Whatever lies under a node is a run of the front-to-back order, so it folds by itself. Done after
         each node, what is held grows with the depth of the tree and not with the number of nodes.
 
         Args:
-            parts: by node; None for one that shows nothing.
+            parts: by node, FrozenLayers; None for one that shows nothing.
+            fold: makes one of a near and a far part, if they are something else.
         """
-        center = view.center.double().cpu()
         while node:
             node = int(self.tree.parent[node])
-            near, far = node_children_in_order(self.tree, node, center)
+            near, far = node_children_in_order(self.tree, node, seen.center)
             if near not in parts or far not in parts:
                 return
-            parts[node] = _over(parts.pop(near), parts.pop(far))
+            front, behind = parts.pop(near), parts.pop(far)
+            is_whole = front is not None and behind is not None
+            parts[node] = (fold or _over)(front, behind) if is_whole else front or behind
 
     def fold(self, parts: dict[int, FrozenLayers | None], view: View, crop: Crop) -> FrozenLayers:
         """What `fold_up` has made of all nodes: one layer in front of the active block and one behind, and
         what is inside in one."""
-        nothing = self._nothing(view, crop)
-        return parts[0] or FrozenLayers(nothing, nothing)
+        if parts[0] is None:
+            return FrozenLayers(self._nothing(view, crop), self._nothing(view, crop), crop=crop)
+        return _widened(parts[0], crop)
 
     @torch.no_grad()
     def picture(self, view: View, settings: RenderSettings, stop: float = 0.0) -> Raster:
@@ -263,11 +276,12 @@ class LayerRenderer:
         Args:
             stop: transmittance below which nothing behind is drawn, if no pixel has more.
         """
-        whole, seen_by = self.nothing(view), self.frusta([(view, view.full)])
-        for node in self.order(self.nodes(), view):
+        whole, nodes = self.nothing(view), self.nodes()
+        shown = self.shown(nodes, [(view, view.full)])
+        for node in self.order(nodes, view):
             if float(whole.transmittance.max()) < stop:
                 break
-            gaussians = self.load(node, seen_by).gaussians
+            gaussians = self.load(shown[node]).gaussians
             if len(gaussians):
                 whole = drawn_over(whole, self.raster(node, gaussians, view, settings))
         return whole
@@ -300,16 +314,29 @@ def drawn_over(front: Raster, behind: Raster) -> Raster:
     return Raster(layer.color, layer.transmittance, depth, {})
 
 
-def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:
-    """The parts of two nodes as one, `front` being the nearer; None shows nothing."""
-    if front is None or behind is None:
-        return behind if front is None else front
+def _over(front: FrozenLayers, behind: FrozenLayers) -> FrozenLayers:
+    """The parts of two nodes as one, `front` being the nearer."""
     inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
+    crop = front.crop.joined(behind.crop)
+    front, behind = _widened(front, crop), _widened(behind, crop)
     return FrozenLayers(
         over(front.front, behind.front),
         over(front.back, behind.back),
         Splats(torch.cat(inside, dim=1)) if inside else None,
+        crop,
     )
+
+
+def _widened(part: FrozenLayers, crop: Crop) -> FrozenLayers:
+    """The same on a crop that holds its own."""
+    if part.crop == crop:
+        return part
+    at, wide = part.crop.within(crop).slices, []
+    for layer in (part.front, part.back):
+        empty = empty_layer(crop.height, crop.width, layer.color.device, layer.color.dtype)
+        empty.color[at], empty.transmittance[at] = layer.color, layer.transmittance
+        wide.append(empty)
+    return FrozenLayers(*wide, part.inside, crop)
 
 
 def default_pass(scene: BlockScene) -> int:

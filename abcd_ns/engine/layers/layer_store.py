@@ -85,6 +85,11 @@ class LayerStore:
         """Of all that is kept, wherever it is."""
         return sum(kept.nbytes for kept in self._kept.values())
 
+    @property
+    def free(self) -> int:
+        """Bytes that are left on the device."""
+        return self._device_room
+
     def put(self, view: int, kept: Kept) -> None:
         """Keep what was drawn for a view, which has nothing here yet, if there is room."""
         if kept.nbytes <= self._device_room:

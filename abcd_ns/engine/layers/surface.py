@@ -90,11 +90,12 @@ def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) 
     like = {"device": renderer.device, "dtype": view.viewmat.dtype}
     left = torch.ones((view.height, view.width), **like)
     depth = torch.zeros_like(left)
-    seen_by = renderer.frusta([(view, view.full)])
-    for node in renderer.order(renderer.nodes(), view):
+    nodes = renderer.nodes()
+    shown = renderer.shown(nodes, [(view, view.full)])
+    for node in renderer.order(nodes, view):
         if float(left.max()) <= 0.5:
             break
-        gaussians = renderer.load(node, seen_by).gaussians
+        gaussians = renderer.load(shown[node]).gaussians
         window = renderer.span(node, view, view.full) if node else None
         if len(gaussians):
             left, depth = rasterizer.deepened(

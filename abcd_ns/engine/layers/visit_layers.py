@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import add
 
 from torch import Tensor
 
@@ -17,7 +18,6 @@ from abcd_ns.engine.layers.layer_renderer import (
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.render import ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 
@@ -29,7 +29,7 @@ class VisitLayers:
         own: the block's Gaussians when the visit began; they decide the windows.
         window_weight: see Recipe.
         views: all views, by index.
-        parts_bytes: size of the layers held while nodes are folded.
+        parts_bytes: size of the layers held while nodes are folded, beside what is free in the store.
     """
 
     def __init__(
@@ -51,7 +51,8 @@ class VisitLayers:
         self._nodes = renderer.nodes(exclude=geometry.block)
         self._own = own if renderer.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
-        self._seen_by = renderer.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
+        seen = [(views[view], crop) for view, crop in sorted(geometry.crops.items())]
+        self._shown = renderer.shown(self._nodes, seen, exclude=geometry.block)
         self._windows: dict[int, ZWindow] = {}
         self._sum: Tensor | float = 0.0
 
@@ -69,30 +70,52 @@ class VisitLayers:
                 f"The layers around block {block} have NaN or infinite pixels; another block has diverged."
             )
 
-    def _groups(self, views: Sequence[int]) -> Iterable[Sequence[int]]:
-        """Views that are drawn together: as many as there is room for what their units are folded from."""
-        if len(self._nodes) == 1:
-            return [views]
-        levels = max(map(self._renderer.depth_of, self._nodes), default=0) + 1
-        crops = [self._geometry.crops[view] for view in views]
-        return runs(views, crops, self._parts_bytes // (levels * BYTES_PER_PIXEL))
+    def _groups(self, views: Sequence[int]) -> Iterator[list[int]]:
+        """Views that are drawn together: as many as there is room for what their nodes are folded from, which
+        may be where those are kept that are not drawn yet."""
+        group, held = list[int](), [0] * len(self._nodes)
+        for view in views:
+            own = list(self._held(view))
+            together = list(map(add, held, own))
+            if group and max(together) * BYTES_PER_PIXEL > self._parts_bytes + self._store.free:
+                yield group
+                group, together = [], own
+            group.append(view)
+            held = together
+        if group:
+            yield group
+
+    def _held(self, view: int) -> Iterator[int]:
+        """Pixels of the layers that are held of a view, after each node."""
+        parts: dict[int, Crop | None] = {}
+        seen = self._seen(view)
+        for node in self._nodes:
+            parts[node] = self._shown[node].crops.get(view)
+            self._renderer.fold_up(parts, node, seen, Crop.joined)
+            yield sum(crop.pixels for crop in parts.values() if crop is not None)
+
+    def _seen(self, view: int) -> Seen:
+        return Seen(self._views[view], self._geometry.crops[view], self._windows.get(view))
 
     def _draw_group(self, views: Sequence[int]) -> Iterator[Kept]:
         """All nodes one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
-        block = self._geometry.block
-        seen = [
-            Seen(self._views[view], self._geometry.crops[view], self._windows.get(view)) for view in views
-        ]
+        seen = [self._seen(view) for view in views]
         parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
         for node in self._nodes:
-            loaded = self._renderer.load(node, self._seen_by, exclude=block)
-            drawn = self._renderer.render(node, loaded, seen, self._settings, block)
-            for view, part in zip(views, drawn, strict=True):
+            for one, part in zip(seen, self._draw_node(node, seen), strict=True):
+                view = one.view.index
                 parts[view][node] = part
-                self._renderer.fold_up(parts[view], node, self._views[view])
+                self._renderer.fold_up(parts[view], node, one)
                 if node == self._nodes[-1]:
                     yield self._keep(view, parts.pop(view))
+
+    def _draw_node(self, node: int, seen: Sequence[Seen]) -> Iterator[FrozenLayers | None]:
+        shown = self._shown[node]
+        if not any(one.view.index in shown.crops for one in seen):
+            return iter([None] * len(seen))
+        loaded = self._renderer.load(shown)
+        return self._renderer.render(node, loaded, seen, self._settings, self._geometry.block)
 
     def shows(self, view: View) -> bool:
         """Whether this very view is drawn, from where it was when the visit began."""

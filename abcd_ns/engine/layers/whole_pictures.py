@@ -22,6 +22,7 @@ from abcd_ns.engine.layers.layer_renderer import (
     LayerRenderer,
     Loaded,
     RenderSettings,
+    Shown,
     drawn_over,
 )
 from abcd_ns.engine.render import Raster
@@ -83,15 +84,15 @@ class WholePictures:
             after: called when a node's fragments in a view have left theirs; those of other nodes are others.
         """
         if len(self._nodes) == 1:
-            loaded = self._load(self._nodes[0], views)
+            loaded = self._renderer.load(self._shown(views)[self._nodes[0]])
             for view in views:
                 self._backward_through_one(loaded, view, gradient)
                 after()
             return
         parts = self._draw(views)
         pulls = [gradient(view, self._picture(view, own)) for view, own in zip(views, parts, strict=True)]
-        for node in self._nodes:
-            loaded = self._load(node, views)
+        for node, shown in self._shown(views).items():
+            loaded = self._renderer.load(shown)
             for view, own, pull in zip(views, parts, pulls, strict=True):
                 if node in own:
                     self._differentiate(node, loaded, view, own, pull)
@@ -105,15 +106,15 @@ class WholePictures:
         if raster is not None:
             raster.color.backward(pull, retain_graph=True)  # views share what leads to the loaded Gaussians
 
-    def _load(self, node: int, views: Sequence[View]) -> Loaded:
-        return self._renderer.load(node, self._renderer.frusta((v, v.full) for v in views))
+    def _shown(self, views: Sequence[View]) -> dict[int, Shown]:
+        return self._renderer.shown(self._nodes, [(view, view.full) for view in views])
 
     @torch.no_grad()
     def _draw(self, views: Sequence[View]) -> list[dict[int, Raster]]:
         """Of each view, the nodes that show in it, front to back."""
         parts: list[dict[int, Raster]] = [{} for _ in views]
-        for node in self._nodes:
-            loaded = self._load(node, views)
+        for node, shown in self._shown(views).items():
+            loaded = self._renderer.load(shown)
             for view, own in zip(views, parts, strict=True):
                 if loaded.shows_in(view):
                     own[node] = _part(self._raster(node, loaded, view))

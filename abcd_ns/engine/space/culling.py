@@ -4,6 +4,7 @@ A block's bounds are a few numbers, known once the block was read. Without them,
 would read every block of it for every part of space that it draws.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
 import torch
@@ -11,13 +12,15 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from abcd_ns.engine.space.tree import EVERYWHERE, Box, in_float64
-from abcd_ns.engine.space.visibility import reach_radius, widest_slant, world_size
+from abcd_ns.engine.space.visibility import footprint, reach_radius, widest_slant
 from abcd_ns.engine.types import Crop, Gaussians, View, centers_of
 
 BOUNDS_SLANT = 3.0
 """The largest `widest_slant` that bounds allow for: fields of view up to about 140 degrees."""
 ROUNDING = 2.0
 """Frusta are this much wider than what they must hold, px; generously."""
+CROP_ALIGN = 16
+"""Crops begin and end on multiples of so many pixels, or at the image's edge."""
 
 
 def bounds_of(gaussians: Gaussians) -> Box | None:
@@ -50,47 +53,66 @@ class Frusta:
     """
 
     def __init__(self, seen: Iterable[tuple[View, Crop]], slack: float) -> None:
-        self.seen = tuple(seen)
-        self._planes = _planes(self.seen, ROUNDING + slack)
+        self.seen, self._margin = tuple(seen), ROUNDING + slack
+        self._forms = _forms([view for view, _ in self.seen])
+        edges = [(c.x, c.y, c.x + c.width, c.y + c.height) for _, c in self.seen]
+        self._edges = torch.tensor(edges, dtype=torch.float64).reshape(-1, 2, 2)
+        self._near = torch.tensor([view.near for view, _ in self.seen], dtype=torch.float64)[:, None]
 
-    def may_show(self, boxes: Sequence[Box]) -> Bool[Tensor, "n v"]:
+    def may_show(
+        self, boxes: Float64[Tensor, "n 2 3"], rows: Sequence[int] | slice = slice(None)
+    ) -> Bool[Tensor, "n v"]:
         """Whether something in each box may be drawn in each crop; False is certain.
 
         A box is out of sight if all its corners are beyond one of the planes.
         """
-        if not boxes:
-            return torch.zeros(0, len(self.seen), dtype=torch.bool)
-        corners = _corners(torch.stack([torch.stack((box.lower, box.upper)) for box in boxes]))
-        inward = torch.einsum("nca,vpa->nvpc", corners, self._planes[..., :3]) + self._planes[..., 3:]
-        # A corner without end may give NaN, which is not below 0: then the box may show.
-        return ~(inward < 0).all(dim=3).any(dim=2)
+        return self._look(boxes, rows)[0]
 
-    def hold(self, points: Float[Tensor, "n 3"], rows: Sequence[int]) -> Bool[Tensor, "r"]:
-        """Whether any of the points is inside, of the frusta at `rows`."""
-        planes = self._planes[list(rows)]
-        inward = torch.einsum("na,vpa->pnv", in_float64(points).cpu(), planes[..., :3])
-        return (inward + planes[..., 3].T[:, None]).amin(dim=0).amax(dim=0) >= 0
+    def crops(self, boxes: Float64[Tensor, "n 2 3"]) -> tuple[Bool[Tensor, "n v"], dict[int, Crop]]:
+        """`may_show`, and by the views' indices the pixels of the crops in which it may be."""
+        shows, xy, z = self._look(boxes)
+        if not len(boxes):
+            return shows, {}
+        xy = xy / z[:, :, None]
+        # A box that reaches behind the camera may be drawn anywhere.
+        known = ((z > self._near) & xy.isfinite().all(dim=2)).all(dim=2)
+        lower = torch.where(known[..., None], xy.amin(dim=3), -math.inf)
+        upper = torch.where(known[..., None], xy.amax(dim=3), math.inf)
+        lower = torch.where(shows[..., None], lower, math.inf).amin(dim=0)
+        upper = torch.where(shows[..., None], upper, -math.inf).amax(dim=0)
+        found = {}
+        for row in shows.any(dim=0).nonzero()[:, 0].tolist():
+            view, crop = self.seen[row]
+            extent = (*lower[row].tolist(), *upper[row].tolist())
+            drawn = footprint(extent, view, margin=math.ceil(self._margin), align=CROP_ALIGN)
+            if drawn is not None and (shared := drawn.shared(crop)) is not None:
+                found[view.index] = shared
+        return shows, found
+
+    def _look(
+        self, boxes: Tensor, rows: Sequence[int] | slice = slice(None)
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What `may_show` gives; of the corners, [n v 2 8] pixels times z, and [n v 8] z."""
+        forms, edges, near = self._forms[rows], self._edges[rows], self._near[rows]
+        corners = torch.einsum("nca,vpa->nvpc", _corners(boxes), forms[..., :3]) + forms[..., 3:]
+        xy, z = corners[:, :, :2], corners[:, :, 2]
+        low, high = (
+            (edges[:, side, :, None] + sign * self._margin) * z[:, :, None]
+            for side, sign in ((0, -1), (1, 1))
+        )
+        beyond = torch.cat((xy < low, xy > high, (z < near)[:, :, None]), dim=2)
+        # A corner without end may give NaN, which is beyond nothing: then the box may show.
+        return ~beyond.all(dim=3).any(dim=2), xy, z
 
 
-def _planes(seen: Sequence[tuple[View, Crop]], margin: float) -> Float64[Tensor, "v 5 4"]:
-    """(a, b) of each plane, a x + b >= 0 being the side that is seen."""
-    if not seen:
-        return torch.zeros(0, 5, 4, dtype=torch.float64)
-    views, crops = zip(*seen, strict=True)
-    matrices, K = (
-        in_float64(torch.stack([getattr(view, name) for view in views])).cpu() for name in ("viewmat", "K")
-    )
-    starts, sizes = torch.tensor(crops, dtype=torch.float64)[..., None].split(2, dim=1)
-    z = matrices[:, 2]
-    near = z.clone()
-    near[:, 3] -= torch.tensor([view.near for view in views], dtype=torch.float64)
-    planes = [near]
-    for axis in range(2):
-        # The pixel's coordinate times z.
-        pixel = K[:, axis, axis, None] * matrices[:, axis] + K[:, axis, 2, None] * z
-        planes.append(pixel - (starts[:, axis] - margin) * z)
-        planes.append((starts[:, axis] + sizes[:, axis] + margin) * z - pixel)
-    return torch.stack(planes, dim=1)
+def _forms(views: Sequence[View]) -> Float64[Tensor, "v 3 4"]:
+    """A point's pixel times its camera z, and that z, as linear forms of the point."""
+    if not views:
+        return torch.zeros(0, 3, 4, dtype=torch.float64)
+    given = ([view.viewmat for view in views], [view.K for view in views])
+    matrices, K = (in_float64(torch.stack(each)).cpu()[..., None] for each in given)
+    x, y, z = matrices[:, :3, :, 0].unbind(1)
+    return torch.stack((K[:, 0, 0] * x + K[:, 0, 2] * z, K[:, 1, 1] * y + K[:, 1, 2] * z, z), dim=1)
 
 
 def _corners(boxes: Float64[Tensor, "n 2 3"]) -> Float64[Tensor, "n 8 3"]:
@@ -109,20 +131,27 @@ class Optics:
         centers = centers_of(views)
         self._middle = centers.mean(dim=0)
         self._spread = float((centers - self._middle).norm(dim=1).max())
-        self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
-        self._pixels = slack
-        self.slant = max(widest_slant(view) for view in views)
+        focal = torch.stack([view.K for view in views]).diagonal(dim1=1, dim2=2)[:, :2]
+        self._angle = slack / float(focal.min())
+        self.slant = widest_slant(views)
 
     def slack(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """What the screen adds to the reach of Gaussians with these means, as the farthest camera would see
         it; world units."""
-        distance = (means - self._middle.to(means)).norm(dim=1) + self._spread
-        return world_size(self._pixels, distance, self._widest)
+        return ((means - self._middle.to(means)).norm(dim=1) + self._spread) * self._angle
 
-    def drawn_within(self, bounds: Box) -> Box:
-        """Where fragments of Gaussians with these bounds may lie, whatever the view; the slack included."""
-        if self.slant > BOUNDS_SLANT or not bool(bounds.lower.isfinite().all()):
-            return EVERYWHERE
+    def drawn_within(self, bounds: Sequence[Box]) -> Float64[Tensor, "n 2 3"]:
+        """Where fragments of Gaussians with these bounds may lie, whatever the view; the slack included.
+        Boxes, by their lower and upper corners."""
+        boxes = torch.stack([torch.stack((box.lower, box.upper)) for box in (*bounds, EVERYWHERE)])
         # The slack grows with the distance from a point, which is largest at a corner.
-        corners = _corners(torch.stack((bounds.lower, bounds.upper))[None])[0]
-        return bounds.grown(float(self.slack(corners).max()))
+        slack = self.slack(_corners(boxes).flatten(0, 1)).view(-1, 8).amax(dim=1)
+        grown = boxes + slack[:, None, None] * torch.tensor([-1.0, 1.0])[:, None]
+        bounded = boxes[:, 0].isfinite().all(dim=1) & (self.slant <= BOUNDS_SLANT)
+        return torch.where(bounded[:, None, None], grown, boxes[-1])[:-1]
+
+
+def shared(boxes: Float64[Tensor, "n 2 3"], box: Box) -> tuple[Bool[Tensor, "n"], Float64[Tensor, "n 2 3"]]:
+    """Which boxes have a part within another one, faces included, and these parts."""
+    parts = torch.stack((boxes[:, 0].maximum(box.lower), boxes[:, 1].minimum(box.upper)), dim=1)
+    return (parts[:, 0] <= parts[:, 1]).all(dim=1), parts

@@ -104,6 +104,12 @@ class BlockTree:
             side[node][axis[parent]] = threshold[parent]
         return torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
 
+    @cached_property
+    def rows(self) -> list[tuple[int, float, int, int, int]]:
+        """(axis, threshold, left, right, block) of each node, as Python numbers."""
+        columns = (self.axis, self.threshold, self.left, self.right, self.block)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
     def assign(self, points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
         """The block that holds each point, on the points' device. A NaN goes to the right."""
         return torch.cat([self._assign(part) for part in points.split(CHUNK)])
@@ -138,14 +144,13 @@ class BlockTree:
 
     def leaves(self, node: int = 0) -> tuple[int, ...]:
         """The blocks under a node, from left to right."""
-        left, right, block = self.left.tolist(), self.right.tolist(), self.block.tolist()
         found, stack = [], [node]
         while stack:
-            node = stack.pop()
-            if left[node] < 0:
-                found.append(block[node])
+            _, _, left, right, block = self.rows[stack.pop()]
+            if left < 0:
+                found.append(block)
             else:
-                stack += [right[node], left[node]]
+                stack += [right, left]
         return tuple(found)
 
     def split(self, block: int, axis: int, threshold: float) -> "BlockTree":
@@ -156,14 +161,14 @@ class BlockTree:
         Raises:
             ValueError: no such block or axis, or the plane does not cut the block's cell.
         """
-        node, rows = self.node_of(block), self._rows()
+        node, rows = self.node_of(block), list(self.rows)
         rows[node] = (axis, float(threshold), len(rows), len(rows) + 1, -1)
         return tree_from_rows([*rows, (-1, 0.0, -1, -1, block), (-1, 0.0, -1, -1, self.num_blocks)])
 
     def to_json(self) -> str:
         """As text that from_json turns back into the same tree, bit for bit."""
         # json writes a float as repr does: the shortest text that reads back as the same float64.
-        return json.dumps({"format": FORMAT, "nodes": self._rows()})
+        return json.dumps({"format": FORMAT, "nodes": self.rows})
 
     @staticmethod
     def from_json(text: str) -> "BlockTree":
@@ -183,13 +188,8 @@ class BlockTree:
             raise ValueError('block tree: "nodes" must list [axis, threshold, left, right, block] of each')
         return tree_from_rows(rows)
 
-    def _rows(self) -> list[tuple]:
-        """(axis, threshold, left, right, block) of each node, as Python numbers."""
-        columns = (self.axis, self.threshold, self.left, self.right, self.block)
-        return list(zip(*(column.tolist() for column in columns), strict=True))
 
-
-def node_children_in_order(tree: BlockTree, node: int, center: Float[Tensor, "3"]) -> tuple[int, int]:
+def node_children_in_order(tree: BlockTree, node: int, center: Sequence[float]) -> tuple[int, int]:
     """(the child on the side of `center`, the other child) of an inner node: near side first.
 
     A ray that starts on one side of a plane can cross to the other but never back. So whatever lies on the
@@ -200,25 +200,25 @@ def node_children_in_order(tree: BlockTree, node: int, center: Float[Tensor, "3"
     The centre is compared with the threshold in float64, by the rule that BlockTree.assign uses for
     points: exactly on the plane counts as right.
     """
-    axis, left, right = (int(column[node]) for column in (tree.axis, tree.left, tree.right))
-    return (left, right) if float(center[axis]) < float(tree.threshold[node]) else (right, left)
+    axis, threshold, left, right, _ = tree.rows[node]
+    return (left, right) if center[axis] < threshold else (right, left)
 
 
 def nodes_in_order(tree: BlockTree, center: Float[Tensor, "3"]) -> Iterator[int]:
     """All nodes as seen from the camera centre (world space): each before what is under it, and all that is
     under the nearer of two children before the other one."""
-    stack = [0]
+    stack, at = [0], center.tolist()
     while stack:
         node = stack.pop()
         yield node
-        if int(tree.axis[node]) >= 0:
-            near, far = node_children_in_order(tree, node, center)
+        if tree.rows[node][0] >= 0:
+            near, far = node_children_in_order(tree, node, at)
             stack += [far, near]
 
 
 def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...]:
     """All blocks, nearest first, as seen from the camera centre (world space)."""
-    blocks = (int(tree.block[node]) for node in nodes_in_order(tree, center))
+    blocks = (tree.rows[node][4] for node in nodes_in_order(tree, center))
     return tuple(block for block in blocks if block >= 0)
 
 

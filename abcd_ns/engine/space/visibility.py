@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS
-from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.space.tree import Box, in_float64
 from abcd_ns.engine.types import Crop, View
 
 
@@ -38,25 +38,18 @@ def reach_radius(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     return DRAWN_SIGMAS * scales.amax(dim=1).exp()
 
 
-def world_size(pixels: float, depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
-    """How large so many px are at camera z = `depths`, at most; world units: z / f for each."""
-    return depths * (pixels / min(float(view.K[0, 0]), float(view.K[1, 1])))
-
-
-def widest_slant(view: View) -> float:
+def widest_slant(views: Sequence[View]) -> float:
     """How much longer a Gaussian may be drawn at its own camera z than it is: 1 / cos of the widest angle.
 
     Splatting projects along the line of sight onto the plane of the mean's camera z: there an offset
     (dx, dy, dz) lands at (dx - dz x/z, dy - dz y/z), longer by sqrt(1 + (x/z)^2 + (y/z)^2) at most. gsplat
     clamps x/z at the image's border plus 0.15 of its width (0.3 tan of half the field of view); y/z alike.
     """
-    limits = []
-    for size, focal, middle in (
-        (view.width, float(view.K[0, 0]), float(view.K[0, 2])),
-        (view.height, float(view.K[1, 1]), float(view.K[1, 2])),
-    ):
-        limits.append((max(middle, size - middle) + 0.15 * size) / focal)
-    return math.hypot(1.0, *limits)
+    K = in_float64(torch.stack([view.K for view in views])).cpu()
+    size = torch.tensor([(view.width, view.height) for view in views], dtype=torch.float64)
+    middle, focal = K[:, :2, 2], K[:, :2, :2].diagonal(dim1=1, dim2=2)
+    limits = (torch.maximum(middle, size - middle) + 0.15 * size) / focal
+    return float((1 + limits.square().sum(dim=1)).sqrt().max())
 
 
 def reaches(
@@ -73,10 +66,22 @@ def reaches(
     Args:
         slack: what the screen adds, world units: its blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a
             tile's diagonal, as a fragment's place is looked up on the ray through the middle of its tile.
-        slant: the largest `widest_slant` of the views in question.
+        slant: the `widest_slant` of the views in question.
     """
     outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
     return outside.norm(dim=1) <= slant * reach_radius(scales) + slack
+
+
+def straddles(
+    means: Float[Tensor, "n 3"],
+    scales: Float[Tensor, "n 3"],
+    box: Box,
+    slack: Float[Tensor, "n"],
+    slant: float,
+) -> Bool[Tensor, "n"]:
+    """Whether any fragment of each Gaussian may lie outside `box`; see `reaches`."""
+    inside = torch.minimum(means - box.lower.to(means), box.upper.to(means) - means).amin(dim=1)
+    return ~(inside > slant * reach_radius(scales) + slack)
 
 
 def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:

@@ -40,16 +40,15 @@ def layers_of_visit(
     config = run.config
     if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
         return None
-    painted = list(run.views.values())
     layers = VisitLayers(
-        renderer_of(run, run.scene, painted),
+        renderer_of(run, run.scene),
         LayerStore(run.device, room.device, room.ram),
         active.geometry,
         run.scene.gaussians_at_rest(active.geometry.block),
         run.views,
         RenderSettings(active.sh_degree, config.antialiased),
         window_weight=config.recipe.window_weight,
-        parts_bytes=parts_bytes(run, painted, blocks=2),
+        parts_bytes=parts_bytes(run, run.views.values(), blocks=2),
     )
     wanted = tuple(dict.fromkeys(views))
     for done, _ in enumerate(layers.draw(wanted), start=1):
@@ -57,7 +56,7 @@ def layers_of_visit(
     return layers
 
 
-def renderer_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> LayerRenderer:
+def renderer_of(run: TrainingRun, scene: BlockScene) -> LayerRenderer:
     """What draws a scene as the run's options have it.
 
     Args:
@@ -65,7 +64,6 @@ def renderer_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> Layer
     """
     return LayerRenderer(
         scene,
-        views,
         run.rasterizer,
         ownership=run.config.recipe.ownership,
         pass_gaussians=run.config.limits.pass_gaussians or default_pass(scene),

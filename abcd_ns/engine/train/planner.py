@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
 from abcd_ns.engine.space.influence import overlaps, worth_training
+from abcd_ns.engine.space.tree import in_float64
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -257,7 +258,8 @@ class Planner(Visits):
         means = self._scene.gaussians_at_rest(block).means
         found, _, inner, _ = self._culling
         rows = [row for row, view in enumerate(found) if view in views]
-        holds = inner.hold(means[:: -(-len(means) // SAMPLE)], rows).tolist()
+        points = in_float64(means[:: -(-len(means) // SAMPLE)]).cpu()
+        holds = inner.may_show(points[:, None].expand(-1, 2, -1), rows).any(dim=0).tolist()
         return tuple(view for view, held in zip(views, holds, strict=True) if held)
 
     def _views_used(self, state: RunState, seen: int) -> int:
@@ -276,7 +278,7 @@ class Planner(Visits):
             outer, inner = (Frusta(((v, v.full) for v in views), by) for by in (slack, -ROUNDING - 1))
             self._culling = found, outer, inner, Optics(views, slack)
         _, frusta, _, optics = self._culling
-        (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
+        (shows,) = frusta.may_show(optics.drawn_within([bounds])).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 
     def _footprints(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:

@@ -25,10 +25,10 @@ SETTINGS = RenderSettings(sh_degree=1)
 
 
 def layer_renderer(
-    tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0, draw=DRAW
+    tree: BlockTree, gaussians: Gaussians, *, ownership="fragments", pass_gaussians=0, draw=DRAW
 ) -> LayerRenderer:
     scene = MemoryScene(tree, gaussians)
-    return LayerRenderer(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
+    return LayerRenderer(scene, draw, ownership=ownership, pass_gaussians=pass_gaussians)
 
 
 def merged(gaussians: Gaussians, view: View, draw=DRAW) -> Layer:
@@ -85,7 +85,7 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(
     gaussians.means[3:6] *= 40.0
     gaussians.scales[3:6] = math.log(8.0)
     views, draw = views_in_and_out(dtype), DRAWS[primitive, side]
-    renderer = layer_renderer(tree, gaussians, views, draw=draw, pass_gaussians=pass_gaussians)
+    renderer = layer_renderer(tree, gaussians, draw=draw, pass_gaussians=pass_gaussians)
     assert (len(renderer.nodes()) == 1) == (pass_gaussians >= 100)
     for view in views:
         assert difference(renderer.picture(view, SETTINGS), merged(gaussians, view, draw)) < tolerance
@@ -119,7 +119,7 @@ def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():
     gaussians = random_gaussians(200, size=0.15, dtype=torch.float64)
     (view,) = ring_of_views(1, dtype=torch.float64)
     tree = build_kd(gaussians.means, 6)
-    renderer = layer_renderer(tree, gaussians, [view], ownership="means")
+    renderer = layer_renderer(tree, gaussians, ownership="means")
     owner = tree.assign(gaussians.means)
     color, light = torch.zeros(36, 48, 3, dtype=torch.float64), torch.ones(36, 48, dtype=torch.float64)
     for node in renderer.order(renderer.nodes(), view):
@@ -141,21 +141,21 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
     owner = tree.assign(gaussians.means)
     own, frozen = gaussians[owner == 3], gaussians[owner != 3]
     draw = DRAWS[primitive, side]
-    renderer = layer_renderer(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
+    renderer = layer_renderer(tree, gaussians, pass_gaussians=pass_gaussians, draw=draw)
     nodes = renderer.nodes(exclude=3)
-    seen_by = renderer.frusta((view, view.full) for view in views)
-    loaded = {node: renderer.load(node, seen_by, exclude=3) for node in nodes}
+    shown = renderer.shown(nodes, [(view, view.full) for view in views], exclude=3)
+    loaded = {node: renderer.load(shown[node]) for node in nodes}
     for view in views:
         windows = [
             ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
             draw.depth_window(own, view, crop=view.full, visible=0.05),
         ]
         for window in windows:
-            seen = [Seen(view, view.full, window)]
+            seen = Seen(view, view.full, window)
             parts = {}
             for node in nodes:
-                parts[node] = next(renderer.render(node, loaded[node], seen, SETTINGS, 3))
-                renderer.fold_up(parts, node, view)
+                parts[node] = next(renderer.render(node, loaded[node], [seen], SETTINGS, 3))
+                renderer.fold_up(parts, node, seen)
             cut = renderer.fold(parts, view, view.full)
             splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
             assert splats.unique(dim=1).shape == splats.shape

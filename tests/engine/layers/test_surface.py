@@ -26,7 +26,7 @@ def renderer_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gaus
     scene = ChangedScene(MemoryScene(build_kd(SCENE.means, 4), SCENE), lambda _, found: keep(found))
     rasterizer = TorchRasterizer(primitive=primitive)
     options = {"ownership": "fragments", "pass_gaussians": pass_gaussians}
-    return LayerRenderer(scene, VIEWS, rasterizer, **options)
+    return LayerRenderer(scene, rasterizer, **options)
 
 
 def fragments_at(alone: list[Raster], x: int, y: int) -> list[tuple[float, int, float]]:

@@ -19,9 +19,7 @@ VIEWS = ring_of_views(3, dtype=torch.float64)
 
 def whole_pictures_of(pass_gaussians: int, *layers_bytes: int) -> WholePictures:
     scene = MemoryScene(build_kd(SCENE.means, 4), SCENE)
-    renderer = LayerRenderer(
-        scene, VIEWS, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians
-    )
+    renderer = LayerRenderer(scene, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians)
     return WholePictures(renderer, RenderSettings(sh_degree=1), *layers_bytes)
 
 

@@ -15,7 +15,7 @@ from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.space.visibility import footprint, reaches, widest_slant, world_size
+from abcd_ns.engine.space.visibility import footprint, reaches, widest_slant
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -110,8 +110,8 @@ def drawn_and_reached(seed: int, count: int, crop: Crop | None, lower: float, up
     means2d, radii, depths, conics = project(gaussians, view)
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle + lower, torch.tensor(upper).double() + middle)
-    blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
-    reached = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
+    blur = depths.clamp(min=0) * SPLATS.blur_pixels / view.K.diagonal()[:2].min()
+    reached = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant([view]))
     return drawn_in_box(view, crop or view.full, box, means2d, radii, depths, conics), reached
 
 

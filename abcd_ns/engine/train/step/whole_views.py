@@ -43,7 +43,7 @@ class WholeViews:
         run = self._run
         # Half of what a visit's have: here a view is drawn backward beside them.
         room = parts_bytes(run, views, run.blocks, share=0.5)
-        renderer = renderer_of(run, scene, views)
+        renderer = renderer_of(run, scene)
         return WholePictures(renderer, RenderSettings(run.sh_degree, run.config.antialiased), room)
 
     def beside(

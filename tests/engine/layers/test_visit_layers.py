@@ -1,0 +1,62 @@
+"""The layers of a visit: what is read for them, and that no room for them changes them."""
+
+import pytest
+import torch
+
+from abcd_ns.engine.layers.footprints import footprints
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_store import LayerStore
+from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scene import MemoryScene
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+BLOCK = 5
+
+
+class Watched(MemoryScene):
+    """Notes each block of which something was read."""
+
+    def drawn(self, block, device, which=None):
+        self.read.append(block)
+        return super().drawn(block, device, which)
+
+
+def visit_layers(parts_bytes: int, device_bytes: int) -> tuple[VisitLayers, list[int]]:
+    """Of a visit to one of 16 blocks, and the blocks that it has read so far."""
+    gaussians, draw, views = random_gaussians(200, size=0.03), TorchRasterizer(), ring_of_views(6)
+    scene = Watched(build_kd(gaussians.means, 16), gaussians)
+    scene.read = []
+    renderer = LayerRenderer(scene, draw, ownership="fragments", pass_gaussians=0)
+    own = scene.gaussians(BLOCK)
+    layers = VisitLayers(
+        renderer,
+        LayerStore(torch.device("cpu"), device_bytes),
+        footprints(own, BLOCK, views, draw),
+        own,
+        {view.index: view for view in views},
+        RenderSettings(sh_degree=1),
+        window_weight=0.05,
+        parts_bytes=parts_bytes,
+    )
+    return layers, scene.read
+
+
+def test_where_views_have_room_blocks_are_read_twice_at_most_for_all_of_them():
+    """Once to be drawn, once for what reaches from them into others."""
+    layers, read = visit_layers(parts_bytes=0, device_bytes=1 << 30)
+    assert len(list(layers.draw(range(6)))) == 6
+    assert len(read) > 0
+    assert max(read.count(block) for block in range(16)) <= 2
+
+
+@pytest.mark.parametrize("parts_bytes", [0, 100_000])
+def test_layers_are_the_same_whatever_room_there_is(parts_bytes):
+    expected = list(visit_layers(1 << 30, 1 << 30)[0].draw(range(6)))
+    layers, read = visit_layers(parts_bytes, device_bytes=0)
+    for kept, other in zip(layers.draw(range(6)), expected, strict=True):
+        assert torch.equal(kept.layers, other.layers)
+        planes = [one.interleaved.planes if one.interleaved else torch.zeros(0) for one in (kept, other)]
+        assert torch.equal(*planes)
+    assert max(read.count(block) for block in range(16)) > 2
