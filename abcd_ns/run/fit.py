@@ -2,6 +2,7 @@
 
 import math
 from bisect import bisect_left
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import psutil
@@ -13,7 +14,6 @@ from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import (
-    GROWING_DEGREE,
     PHOTO_SHARE,
     DeviceNeeds,
     fewest_blocks,
@@ -39,6 +39,8 @@ KEPT_SHARE = 0.4
 """Of the machine's RAM for the same, where that is less."""
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
+FEW = 8
+"""Blocks: each step trains one, so where there would be more, fewer harmonics make them fewer."""
 LEAST_LIMIT = 100
 """The same where the budget is for Gaussians alone, which small scenes are compared by."""
 PICTURE_SHARE = 0.75
@@ -157,8 +159,12 @@ class Demand:
         training, views = self.training, views_per_step(self.training.batch, blocks)
         at_once = min(views, self.at_once)
         options = (training.sh_degree, crop_pixels, levels, not self.on_cpu, training.primitive)
-        degree = min(GROWING_DEGREE, training.sh_degree) if self.late_harmonics else None
+        degree = max(training.sh_degree - self.late_harmonics, 0)
         return DeviceNeeds(self.pixels, at_once, *options, views - at_once, degree)
+
+    def with_fewer_harmonics(self) -> Iterator["Demand"]:
+        """The same with all degrees of harmonics while blocks grow, and with ever fewer."""
+        return (replace(self, late_harmonics=late) for late in range(self.training.sh_degree + 1))
 
     def most_beside(self, limit: int) -> int:
         """Frozen Gaussians that a pass may draw beside a block at its limit. The least room for them is where
@@ -178,13 +184,9 @@ def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory:
     Raises:
         UserError: the budget has no room for any block worth a visit; says what would help.
     """
-    fit = _fit(budget, demand)
-    if fit is not None and fit.blocks == 1:
-        return fit
-    demand = replace(demand, late_harmonics=1)
-    fit = _fit(budget, demand)
-    if fit is None:
-        raise UserError(_refusal(budget, demand, downscale, memory))
+    each = list(demand.with_fewer_harmonics())
+    if (fit := _best(_fit(budget, one) for one in each)) is None:
+        raise UserError(_refusal(budget, each[-1], downscale, memory))
     return fit
 
 
@@ -194,15 +196,28 @@ def fit_gaussians(room: int, demand: Demand) -> Fit:
     Raises:
         UserError: they would have next to none.
     """
-    whole = _fit_gaussians(room, demand)
-    return whole if whole.blocks == 1 else _fit_gaussians(room, replace(demand, late_harmonics=1))
+    fits = (_fit_gaussians(room, each) for each in demand.with_fewer_harmonics())
+    if (fit := _best(fits)) is None:
+        limit = room // demand.needs(2, 0, levels=0).gaussian_bytes
+        raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
+    return fit
 
 
-def _fit_gaussians(room: int, demand: Demand) -> Fit:
+def _best(fits: Iterable[Fit | None]) -> Fit | None:
+    """The first with FEW blocks; if none has, the last."""
+    found = None
+    for fit in fits:
+        found = fit or found
+        if fit is not None and fit.blocks <= FEW:
+            break
+    return found
+
+
+def _fit_gaussians(room: int, demand: Demand) -> Fit | None:
     training = demand.training
     sole, limit = (room // demand.needs(blocks, 0, levels=0).gaussian_bytes for blocks in (1, 2))
     if limit < LEAST_LIMIT:
-        raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
+        return None
     blocks, overlap = _fewest(demand.first, limit, sole), training.recipe.overlap
     if overlap > 0:  # an isolated block begins with what lies around its cell, too, and is never cut
         blocks, limit, sole = _fewest(math.ceil((1 + 2 * overlap) ** 2 * demand.first), limit, 0), 0, limit

@@ -13,7 +13,6 @@ from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import (
-    GROWING_DEGREE,
     DeviceNeeds,
     coarse_model_size,
     degree_with_room,
@@ -21,7 +20,7 @@ from abcd_ns.engine.train.memory import (
     limits_at,
 )
 from abcd_ns.errors import UserError
-from abcd_ns.run.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
+from abcd_ns.run.fit import FEW, LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
 from tests.reference.scenes import training_config
 
@@ -38,7 +37,7 @@ def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = Non
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
-    waiting, degree = 0 if blocks == 1 else 3, GROWING_DEGREE if fit.late_harmonics else None
+    waiting, degree = 0 if blocks == 1 else 3, 3 - fit.late_harmonics
     options = {"crop_pixels": fit.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
     return DeviceNeeds(pixels, 1, **options, live_degree=degree)
 
@@ -115,7 +114,8 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
     fit = fit_for(8, PIXELS, 30_000_000)
     training = training_config(**fit.limits)
     growing, most = needs_of(fit, PIXELS, blocks), training.limits.of_block(blocks)
-    for degree in range(GROWING_DEGREE + 1, 4):
+    assert training.growing_degree == 3 - fit.late_harmonics < 3
+    for degree in range(training.growing_degree + 1, 4):
         few = limits_at(training, degree).of_block(blocks)
         needs = dataclasses.replace(growing, live_degree=degree)
         assert needs.bytes_for(few) <= growing.bytes_for(most) < needs.bytes_for(few + 2)
@@ -123,9 +123,10 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
         assert degree_with_room(training, int(FULL * few) + 1, blocks, FULL) == degree - 1
 
 
-def test_harmonics_come_late_only_where_memory_cuts_a_scene():
-    assert fit_for(8, PIXELS, 10_000).late_harmonics == 0
-    assert fit_for(8, PIXELS, 30_000_000).late_harmonics == 1
+def test_as_many_harmonics_come_late_as_blocks_would_be_many():
+    fits = [fit_for(8, PIXELS, millions * 10**6) for millions in (1, 10, 30, 300)]
+    assert [fit.late_harmonics for fit in fits] == [0, 0, 2, 3]
+    assert [fit.blocks <= FEW for fit in fits] == [True, True, True, False]
 
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():

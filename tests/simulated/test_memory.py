@@ -15,7 +15,7 @@ from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import GROWING_DEGREE, DeviceNeeds, drawing_bytes, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
@@ -67,13 +67,13 @@ def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, given):
     assert large - small <= model[1] - model[0] <= LAVISH * (large - small)
 
 
-LATE = {"density": GROWING, "late_harmonics": 1}
+LATE = {"density": GROWING, "late_harmonics": 3}
 GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
 
 
 @pytest.mark.parametrize("batch", [1, 4])
 @pytest.mark.parametrize(
-    "given", [{"density": GROWING}, GROWING_SURFELS, {"density": GROWING, "late_harmonics": 1}]
+    "given", [{"density": GROWING}, GROWING_SURFELS, {"density": GROWING, "late_harmonics": 3}]
 )
 def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given, batch):
     options = {"width": 32, "batch": batch, **given}
@@ -81,7 +81,7 @@ def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given, batch):
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
     primitive = given.get("primitive", "3dgs")
-    degree = GROWING_DEGREE if "late_harmonics" in given else None
+    degree = 3 - given.get("late_harmonics", 0)
     needs = DeviceNeeds(32**2, batch, levels=0, primitive=primitive, live_degree=degree)
     model = needs.gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)

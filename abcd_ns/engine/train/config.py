@@ -58,6 +58,11 @@ class TrainingConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
+    @property
+    def growing_degree(self) -> int:
+        """Highest degree of spherical harmonics while blocks grow."""
+        return max(self.sh_degree - self.limits.late_harmonics, 0)
+
     def room(self, scene: int, block: int, limit: int) -> int | None:
         """Gaussians that may be added to a block of so many in a scene of so many; None for any number.
 

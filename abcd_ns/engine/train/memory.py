@@ -38,8 +38,6 @@ LAYER_SHARE = 1 / 8
 """Of the device's budget, for the layers of a visit."""
 PHOTO_SHARE = 1 / 8
 """Of the device's budget, for photos that are kept there."""
-GROWING_DEGREE = 0
-"""Of harmonics while blocks grow, where memory cuts a scene: there are fewer Gaussians afterwards."""
 LIVE_COPIES = 5
 """Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
 
@@ -171,8 +169,7 @@ def needs_of_step(
     """The same where a step has so many views."""
     limits = config.limits
     at_once, crop = min(views, limits.batch_limit or views), limits.crop_pixels
-    if sh_degree is None and limits.late_harmonics:
-        sh_degree = min(GROWING_DEGREE, config.sh_degree)
+    sh_degree = config.growing_degree if sh_degree is None else sh_degree
     options = {"primitive": config.primitive, "waiting": views - at_once, "live_degree": sh_degree}
     return DeviceNeeds(pixels, at_once, config.sh_degree, crop, **options)
 
@@ -180,7 +177,7 @@ def needs_of_step(
 def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
     """The limits of a run whose blocks have come to this degree of spherical harmonics."""
     limits = config.limits
-    if not limits.late_harmonics or sh_degree <= GROWING_DEGREE:
+    if sh_degree <= config.growing_degree:
         return limits
     sole, block = (
         limit
@@ -198,9 +195,9 @@ def degree_with_room(config: TrainingConfig, largest: int, blocks: int, full: fl
         largest: Gaussians.
         full: share of its limit that a block may fill.
     """
-    degrees = range(config.sh_degree, GROWING_DEGREE, -1)
-    fits = (d for d in degrees if largest <= full * limits_at(config, d).of_block(blocks))
-    return next(fits, min(GROWING_DEGREE, config.sh_degree))
+    least = config.growing_degree
+    degrees = range(config.sh_degree, least, -1)
+    return next((d for d in degrees if largest <= full * limits_at(config, d).of_block(blocks)), least)
 
 
 def levels_of(blocks: int) -> int:

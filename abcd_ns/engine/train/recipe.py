@@ -80,8 +80,8 @@ class Limits:
     """Gaussians of the warm-up's coarse model at most, see `memory.coarse_model_size`; 0 is as many as there
     are in the beginning."""
     late_harmonics: int = 0
-    """1: while blocks grow they have harmonics of degree `memory.GROWING_DEGREE` at most, which the other
-    limits count on. Higher degrees come once growth is over, as far as there is room."""
+    """Degrees of spherical harmonics that blocks do not have while they grow, which the other limits count
+    on. They come once growth is over, as far as there is room."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
 

@@ -19,7 +19,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.health.health import Health
-from abcd_ns.engine.train.memory import GROWING_DEGREE, degree_with_room, limits_at
+from abcd_ns.engine.train.memory import degree_with_room, limits_at
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
@@ -119,7 +119,7 @@ class TrainingRun:
     @property
     def _degree_limit(self) -> int:
         """What limits leave for the degree; it never falls."""
-        config, blocks, found = self.config, self.blocks, GROWING_DEGREE
+        config, blocks, found = self.config, self.blocks, self.config.growing_degree
         if not config.limits.late_harmonics:
             return config.sh_degree
         if self.share >= config.density.refine_stop:

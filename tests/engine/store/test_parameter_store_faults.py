@@ -205,7 +205,7 @@ def test_an_altered_manifest_is_found_even_if_json_reads_it_alike(store):
             ParameterStore.open(store.folder, read_only=True)
 
 
-@pytest.mark.parametrize("version", [5, 7, "6", None])
+@pytest.mark.parametrize("version", [6, 8, "7", None])
 def test_older_and_newer_formats_are_named(store, version):
     store.close()
     path = manifest_path(store.folder)

@@ -4,11 +4,10 @@ import pytest
 
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
-from abcd_ns.engine.train.memory import GROWING_DEGREE
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, whole_scene
 
-LATE = {"blocks": 4, "steps": 96, "density": STILL, "late_harmonics": 1}
+LATE = {"blocks": 4, "steps": 96, "density": STILL, "late_harmonics": 2}
 ROOMY, TIGHT = 1000, 41
 """Gaussians that a block may have while it grows; there are 30."""
 
@@ -29,7 +28,7 @@ def test_what_is_live_has_no_more_harmonics_than_are_in_use(make, photos, start)
         train_step(coordinator, photos)
         if coordinator.state.active is not None:
             found.add((coordinator.run.share < 0.5, live_gaussians(coordinator.params).sh_degree))
-    assert {degree for is_early, degree in found if is_early} == {GROWING_DEGREE}
+    assert {degree for is_early, degree in found if is_early} == {0}
     assert (False, start.sh_degree) in found
     assert highest_of(coordinator) == start.sh_degree
 
@@ -37,7 +36,7 @@ def test_what_is_live_has_no_more_harmonics_than_are_in_use(make, photos, start)
 def test_where_there_is_no_room_they_do_not_come(make, photos):
     coordinator = make(block_limit=TIGHT, **LATE)
     train(coordinator, photos)
-    assert highest_of(coordinator) == GROWING_DEGREE
+    assert highest_of(coordinator) == 0
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
