@@ -23,7 +23,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Loaded
 from abcd_ns.engine.render import CutShot
@@ -127,9 +127,9 @@ class Town:
 
     def gaussians(self) -> Gaussians:
         """Opaque ones with all their harmonics."""
-        found = gaussians_from_points(
+        found = cloud_from_points(
             self.points(), 255 * self._uniform(self.blocks * self.args.gaussians, 3)
-        )
+        ).gaussians()
         rest = 0.02 * torch.randn(found.features_rest.shape, generator=self._random)
         scales = found.scales + math.log(self.args.gaussians / BLOCK) / 2
         return replace(

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from abcd_ns.lab.world.world import TABLE, Surfaces, ring
 from abcd_ns.progress_bar import ProgressBar
 
-WORLD = Surfaces(tuple(replace(surface, fineness=4.0) for surface in TABLE.surfaces))
+WORLD = Surfaces(tuple(replace(surface, fineness=4.0) for surface in TABLE.surfaces), seed=1, plain=0.9)
 MODEL = Path("sparse/0")
 LAST = MODEL / "points3D.bin"
 """A folder with this file is whole."""

@@ -120,6 +120,8 @@ class Surfaces(World):
 
     surfaces: tuple[Ball | Wall, ...]
     seed: int = 0
+    plain: float = 0.0
+    """Share of the waves that is the same for all colours: with 1 a surface has shades of one colour."""
 
     def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:  # noqa: ARG002 - waves are broad
         """As World.look."""
@@ -143,7 +145,9 @@ class Surfaces(World):
         if isinstance(surface, Ball) and surface.radius > 1:
             places = places / surface.radius  # a far shell is as finely textured, as it looks
         waves = torch.sin(surface.fineness * torch.einsum("nk,cwk->ncw", places, turns) + phase)
-        return (base + 0.12 * waves.sum(dim=-1)).clamp(0.02, 0.98)
+        waves = waves.sum(dim=-1)
+        waves = waves.lerp(waves.mean(dim=1, keepdim=True), self.plain)
+        return (base + 0.12 * waves).clamp(0.02, 0.98)
 
 
 def rays_through(view: View, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
