@@ -31,7 +31,6 @@ from abcd_ns.nerfstudio.options import (
 )
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.run.begin import grid_counts
-from tests.reference.scenes import random_gaussians
 
 METHODS = {
     found.config.method_name: found.config
@@ -184,11 +183,10 @@ def test_what_has_no_effect_or_cannot_be_is_refused_from_files_too(way, value, s
 )
 def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, blocks):
     """It has more of them than were asked for, or as many; and that is found out soon."""
-    gaussians = random_gaussians(50)
-    gaussians.means[:] = torch.linspace(0, 1, 50)[:, None] * torch.tensor(extent)
+    means = torch.linspace(0, 1, 50)[:, None] * torch.tensor(extent)
     with pytest.raises(UserError, match=rf"^{blocks} blocks make .* give fewer --pipeline.blocks"):
-        grid_counts(gaussians, blocks)
-    assert math.prod(grid_counts(gaussians, 1000)) >= 1000
+        grid_counts(means, blocks)
+    assert math.prod(grid_counts(means, 1000)) >= 1000
 
 
 @pytest.mark.parametrize(
