@@ -39,7 +39,7 @@ KEPT_SHARE = 0.4
 """Of the machine's RAM for the same, where that is less."""
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
-FEW = 8
+FEW = 4
 """Blocks: each step trains one, so where there would be more, fewer harmonics make them fewer."""
 LEAST_LIMIT = 100
 """The same where the budget is for Gaussians alone, which small scenes are compared by."""

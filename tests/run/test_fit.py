@@ -124,7 +124,7 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
 
 
 def test_as_many_harmonics_come_late_as_blocks_would_be_many():
-    fits = [fit_for(8, PIXELS, millions * 10**6) for millions in (1, 10, 30, 300)]
+    fits = [fit_for(8, PIXELS, millions * 10**6) for millions in (1, 10, 15, 300)]
     assert [fit.late_harmonics for fit in fits] == [0, 0, 2, 3]
     assert [fit.blocks <= FEW for fit in fits] == [True, True, True, False]
 
