@@ -145,7 +145,7 @@ class AbcdModel(SplatfactoModel):
         read everything from disk."""
         if self._coordinator is None:
             return live_gaussians(self.gauss_params).detach()
-        return self._coordinator.scene.everything(device).of_degree(self.config.sh_degree)
+        return self._coordinator.scene.everything(device)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 

@@ -44,7 +44,7 @@ class AssignedScene(VisitScene):
 
     # What only the active block is asked for is of the assigned one, as its visit found it.
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:  # noqa: ARG002
+    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
         self._live = live
 
     def state(self, name: BlockName) -> BlockState:  # noqa: ARG002

@@ -65,8 +65,12 @@ class VisitScene(BlockScene, Protocol):
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
-        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
+    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest.
+
+        Args:
+            sh_degree: of the scene's harmonics, of which what is live may have fewer by now.
+        """
 
 
 class MemoryScene(BlockScene):
@@ -199,8 +203,8 @@ class StoredScene(VisitScene):
         finally:
             self.store.close()
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
-        self._live = (block, live)
+    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+        self._live, self._sh_degree = (block, live), sh_degree
 
     def clear_live(self) -> None:
         """No block is live any more."""
@@ -271,8 +275,12 @@ class StoredScene(VisitScene):
     def gaussians(self, block: int) -> Gaussians:
         if not self._is_live(block):
             return self.drawn(block, "cpu")
-        live = self._live[1]().detach()
+        live = self._all_live()
         return live[self.tree.assign(live.means) == block] if self.is_live_as_a_whole else live
+
+    def _all_live(self) -> Gaussians:
+        live = self._live[1]().detach()
+        return live.of_degree(max(self._sh_degree, live.sh_degree))
 
     def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
         """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
@@ -290,7 +298,7 @@ class StoredScene(VisitScene):
     def everything(self, device: torch.device | str) -> Gaussians:
         """All blocks, one after the other."""
         if self.is_live_as_a_whole:  # who lives where is asked once
-            live = self._live[1]().detach()
+            live = self._all_live()
             return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 

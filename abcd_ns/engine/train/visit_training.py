@@ -79,7 +79,7 @@ class VisitTraining:
         self.live.attach(active, self.batch, max(active.sh_degree, self.degree))
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
         self._reach = run.reach(active.trained_on)
-        run.scene.set_live(block, self._visits.attached(active, run.params))
+        run.scene.set_live(block, self._visits.attached(active, run.params), run.config.sh_degree)
         gaussians, self.influence = len(self.live), None
         if active.is_whole:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
@@ -249,11 +249,11 @@ class VisitTraining:
         return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
 
     def _draw(self, samples: Sequence[Sample]) -> Rendered:
-        run = self.run
+        run, live = self.run, live_gaussians(self.run.params)
         rasters = run.rasterizer.draw(
-            live_gaussians(run.params),
+            live,
             [sample.shot for sample in samples],
-            sh_degree=self.degree,
+            sh_degree=min(self.degree, live.sh_degree),  # by time, it may have risen since `next_batch`
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
             judge=run.density.asks(run.share, first=self.live.clocks.visits == 0),

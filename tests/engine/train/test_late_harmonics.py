@@ -42,3 +42,23 @@ def test_where_there_is_no_room_they_do_not_come(make, photos):
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks):
     assert_resumes(make, photos, 30, 47, 60, **{**LATE, "blocks": blocks}, block_limit=ROOMY)
+
+
+def test_while_the_degree_rises_others_see_all_harmonics(make, photos, start):
+    """As a viewer does, which draws with the highest degree at any time."""
+    coordinator = make(blocks=1, steps=40, density=STILL)
+    train(coordinator, photos, steps=1)
+    assert live_gaussians(coordinator.params).sh_degree < start.sh_degree
+    assert coordinator.scene.gaussians(0).sh_degree == start.sh_degree
+    assert coordinator.scene.everything("cpu").sh_degree == start.sh_degree
+
+
+def test_a_degree_that_rises_within_a_step_waits_for_the_next(make, photos, monkeypatch):
+    """As where a run's budget is time."""
+    coordinator = make(blocks=1, steps=40, density=STILL)
+    batch = coordinator.next_batch()
+    monkeypatch.setattr(type(coordinator.run), "sh_degree", 1)
+    coordinator.render(batch)
+    assert live_gaussians(coordinator.params).sh_degree == 0
+    coordinator.next_batch()
+    assert live_gaussians(coordinator.params).sh_degree == 1
