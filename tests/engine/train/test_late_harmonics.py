@@ -53,7 +53,7 @@ def test_while_the_degree_rises_others_see_all_harmonics(make, photos, start):
     assert coordinator.scene.everything("cpu").sh_degree == start.sh_degree
 
 
-def test_a_degree_that_rises_within_a_step_waits_for_the_next(make, photos, monkeypatch):
+def test_a_degree_that_rises_within_a_step_waits_for_the_next(make, monkeypatch):
     """As where a run's budget is time."""
     coordinator = make(blocks=1, steps=40, density=STILL)
     batch = coordinator.next_batch()
