@@ -141,6 +141,7 @@ class VisitWorker:
         )
         run.state = RunState(
             step=task.step,
+            sh_degree=task.active.sh_degree,
             sweep=task.sweep,
             visit=task.active.number + 1,
             influence={block: {}},

@@ -11,6 +11,7 @@ from abcd_ns.cluster.dispatcher import LOSSES, Dispatcher
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.commit import with_pending
+from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -73,6 +74,18 @@ def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos,
     assert alone.state.step == assigned.state.step == 60
     assert equal(whole_scene(alone), whole_scene(assigned))
     assert alone.state.to_json() | {"seconds": 0} == assigned.state.to_json() | {"seconds": 0}
+
+
+def test_workers_keep_to_the_room_that_harmonics_leave(make, photos, monkeypatch):
+    """Which came while blocks in their first visits still grow."""
+    monkeypatch.setattr(control, "MOST_NEW", 1.0)
+    density = replace(GROWING, refine_stop=0.2, price=0.0)
+    options = {"density": density, "late_harmonics": 2, "block_limit": 30}
+    alone, assigned = make("alone", **options), make("lent", workers=1, lag=1, **options)
+    for run in (alone, assigned):
+        train(run, photos)
+        assert run.state.sh_degree == 1
+    assert equal(whole_scene(alone), whole_scene(assigned))
 
 
 def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos):
