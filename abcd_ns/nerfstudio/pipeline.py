@@ -157,11 +157,9 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.scored, began = self._views_to_score(), time.monotonic()
         with as_a_command():
             found = super().get_average_eval_image_metrics(*args, **kwargs)
-        taken, scored = (
-            time.monotonic() - began,
-            self.datamanager.scored or len(self.datamanager.eval_dataset),
-        )
-        self._scoring_seconds, self._view_seconds = self._scoring_seconds + taken, taken / max(scored, 1)
+        taken, scored = time.monotonic() - began, self.datamanager.scored
+        self._scoring_seconds += taken
+        self._view_seconds = taken / max(scored or len(self.datamanager.eval_dataset), 1)
         self.datamanager.scored = None
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))

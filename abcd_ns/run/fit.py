@@ -102,8 +102,13 @@ class Fit:
         if not self.limit:
             grows = "there is no room for the layers of more, and the scene stops growing at that."
         budget = f"{bytes_in_words(self.budget)} of the device allow {limit:,} Gaussians in a block"
-        parts = f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels."
-        return f"{budget}: {blocks} to begin with; {grows}{parts if self.crop_pixels else ''}"
+        notes = []
+        if self.crop_pixels:
+            notes.append(f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels.")
+        if self.late_harmonics:
+            late = "highest degree" if self.late_harmonics == 1 else f"{self.late_harmonics} highest degrees"
+            notes.append(f" Harmonics of the {late} come after growth.")
+        return f"{budget}: {blocks} to begin with; {grows}{''.join(notes)}"
 
 
 def device_budget(wanted_gb: float, device: torch.device | str) -> int:

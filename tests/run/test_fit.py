@@ -127,6 +127,8 @@ def test_as_many_harmonics_come_late_as_blocks_would_be_many():
     fits = [fit_for(8, PIXELS, millions * 10**6) for millions in (1, 10, 15, 300)]
     assert [fit.late_harmonics for fit in fits] == [0, 0, 2, 3]
     assert [fit.blocks <= FEW for fit in fits] == [True, True, True, False]
+    assert "Harmonics" not in fits[1].in_words()
+    assert "Harmonics of the 2 highest degrees come after growth." in fits[2].in_words()
 
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():

@@ -99,10 +99,9 @@ class DeviceNeeds:
 
     @property
     def _drawn_bytes(self) -> int:
-        frozen = LEAST_PASS * parameter_bytes(self.sh_degree) + DEVICE_SPLATS * projected_bytes(
-            self.primitive
-        )
-        return max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
+        frozen, drawn = parameter_bytes(self.sh_degree), projected_bytes(self.primitive)
+        pixels = max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT
+        return pixels + LEAST_PASS * frozen + DEVICE_SPLATS * drawn
 
     def frozen_beside(self, live: int) -> int:
         """Frozen Gaussians that a pass may draw beside so many live ones: in the room that these have for

@@ -117,6 +117,9 @@ class ProgressReport:
             soft_wrap=True,
         )
         lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
+        wanted, degree = self._coordinator.config.sh_degree, state.sh_degree
+        if self._coordinator.config.limits.late_harmonics and degree < wanted:
+            lines.append(f"harmonics up to degree {degree} of {wanted}: others had no room, or no time")
         for line in lines if state.health else []:  # exact joint training has no visits
             CONSOLE.print(f"  {line}", highlight=False)
 

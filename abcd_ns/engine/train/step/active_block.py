@@ -56,16 +56,18 @@ class ActiveBlock:
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(rows_for_visit(*which), sh_degree, run.device)
         rest = state_for_visit(*which)
-        used = degrees_in_use([rest.gaussians.features_rest])
-        rest = rest.of_degree(max((sh_degree, *used.unique().tolist()))).to(run.device)
+        if sh_degree < self._highest:  # what a block begins with may have more
+            used = degrees_in_use([rest.gaussians.features_rest])
+            rest = rest.of_degree(max((sh_degree, *used.unique().tolist())))
+        rest = rest.to(run.device)
         self.is_new = not active.is_whole and bool(run.scene.state(active.geometry.block).deferred.any())
         if active.done == 0 and not run.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
-        is_new_degree = bool(run.config.limits.late_harmonics)  # has had no time to be of use
-        if active.done == 0 and not (active.saved or active.is_alone or is_new_degree):
+        come_late = run.config.limits.late_harmonics > 0  # and may have had no time to be of use
+        if active.done == 0 and not (active.saved or active.is_alone or come_late):
             self._lower_degrees()
         if active.done == 0 and not active.saved and self.clocks.visits == 0:
             run.health.shrink_oversized(run.views.values(), self._filling())
