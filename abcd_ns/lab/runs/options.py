@@ -16,7 +16,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import nearest
 from abcd_ns.nerfstudio.run.settings import flat_options
 
-LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "pictures": 0}
+LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "pictures": 0, "max_gaussians": 0}
 """The least that a number may be, by option; 1 for those that are not here."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 """A switch."""
