@@ -38,7 +38,7 @@ class VisitTask:
     """Steps of the run before the visit's first one."""
     seconds: float
     """Training time when it begins."""
-    sweep: int
+    epoch: int
     health: BlockHealth
     light: dict[int, Tensor]
     """By view in use, its transform, on the CPU; the worker applies it and leaves it as it is. Empty for none

@@ -169,7 +169,7 @@ class Dispatcher(Coordinator):
             outlines=Outlines(*(list(map(known, blocks)) for known in (scene.count, scene.bounds))),
             step=state.planned,
             seconds=self.stopwatch.seconds,
-            sweep=state.sweep,
+            epoch=state.epoch,
             health=state.health.get(block, BlockHealth()),
             light={} if light is None else {v: light.of(v).detach().cpu() for v in active.views},
             poses=self.run.poses.to_json(),
@@ -218,7 +218,7 @@ class Dispatcher(Coordinator):
                 visit.submitted, active, block = True, visit.active, visit.active.geometry.block
                 if not visit.losses:
                     seen, gaussians = len(active.trained_on), now.outlines.counts[block]
-                    self.announce(VisitBegan(active.number, now.sweep, block, active.steps, seen, gaussians))
+                    self.announce(VisitBegan(active.number, now.epoch, block, active.steps, seen, gaussians))
 
     # -- taking in -----------------------------------------------------------------------------------
 
@@ -255,7 +255,7 @@ class Dispatcher(Coordinator):
         self._in_flight.remove(visit)
         self._ended = visit.ends
         outcome, active, state = visit.outcome, visit.active, self.state
-        block, sweep = active.geometry.block, visit.assignment.task.sweep
+        block, epoch = active.geometry.block, visit.assignment.task.epoch
         state.in_flight.remove(active)
         state.step += outcome.done
         if outcome.shown:
@@ -263,10 +263,10 @@ class Dispatcher(Coordinator):
         state.health[block] = outcome.health
         active.layer_seconds = outcome.layer_seconds
         updates = commit(self.scene, block, outcome.state, self.config.recipe.migrate, visit.taken)
-        rest_after_visit(self.run, active, outcome.state, updates, sweep)
-        queued = state.sweep == sweep and state.queue
-        if not queued and all(other.assignment.task.sweep != sweep for other in self._in_flight):
-            self.announce(EpochEnded(sweep, state.step))
+        rest_after_visit(self.run, active, outcome.state, updates, epoch)
+        queued = state.epoch == epoch and state.queue
+        if not queued and all(other.assignment.task.epoch != epoch for other in self._in_flight):
+            self.announce(EpochEnded(epoch, state.step))
         return True
 
     # -- at rest -------------------------------------------------------------------------------------

@@ -142,7 +142,7 @@ class VisitWorker:
         run.state = RunState(
             step=task.step,
             sh_degree=task.active.sh_degree,
-            sweep=task.sweep,
+            epoch=task.epoch,
             visit=task.active.number + 1,
             influence={block: {}},
             health={block: copy.copy(task.health)},
@@ -153,7 +153,7 @@ class VisitWorker:
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
-        def judge(part: Batch, rendered: Rendered) -> Judgement:
+        def assess(part: Batch, rendered: Rendered) -> Judgement:
             rows = []
             for sample, picture in zip(part.samples, rendered.pictures, strict=True):
                 photo, counts = self._target(sample)
@@ -162,4 +162,4 @@ class VisitWorker:
             pictures, photos, wanted = map(list, zip(*rows, strict=True))
             return training.loss(part, pictures, wanted), squared_errors(pictures, photos)
 
-        take_step(training, training.run.optimizers, judge)
+        take_step(training, training.run.optimizers, assess)

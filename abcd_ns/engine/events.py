@@ -9,7 +9,7 @@ class VisitBegan:
     """A block was attached; its layers are about to be drawn."""
 
     visit: int
-    sweep: int
+    epoch: int
     block: int | None
     """None for the warm-up, in which a coarse model of all blocks is trained."""
     steps: int
@@ -44,7 +44,7 @@ class VisitEnded:
     """The block is at rest; it is on disk TrainingConfig.commit_seconds later at most."""
 
     visit: int
-    sweep: int
+    epoch: int
     block: int | None
     gaussians: int
     """In the block, after migration."""
@@ -60,7 +60,7 @@ class VisitEnded:
 class EpochEnded:
     """An epoch ended: every observed block was visited once more."""
 
-    sweep: int
+    epoch: int
     step: int
 
 

@@ -21,7 +21,7 @@ PAPER = TrainingConfig(
         pixel_loss="l2",
         fast_start=False,
         visit_views=10**6,
-        heal=False,
+        limit_scales=False,
         means_lr_decay=ALONE,
     ),
     warmup=0.0,
@@ -29,7 +29,7 @@ PAPER = TrainingConfig(
     ssim_lambda=0.0,
     point_pixels=0.0,
     coarse=0.0,
-    density=DensityConfig(price=0.0),
+    density=DensityConfig(min_contribution=0.0),
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
 
@@ -71,7 +71,7 @@ abcd_partition = _method(
     training=TrainingConfig(
         recipe=Recipe(layers=False, overlap=0.2, migrate=False, means_lr_decay=ALONE),
         warmup=0.0,
-        density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
+        density=DensityConfig(min_contribution=0.0),  # blocks have one visit, and nothing after it
     ),
 )
 abcd_exact = _method(

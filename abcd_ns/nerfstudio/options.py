@@ -58,7 +58,7 @@ for _not_offered in (Recipe, Limits):
     tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
 _first = ("primitive", "sh_degree", "background", "light", "poses", "antialiased", "warmup", "density")
 shown(*_first)(hidden("seed")(TrainingConfig))
-shown("strategy", "max_gaussians", "price", "split_pixels")(DensityConfig)
+shown("strategy", "max_gaussians", "min_contribution", "split_pixels")(DensityConfig)
 for _config, _flags in SAME.items():
     named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
 

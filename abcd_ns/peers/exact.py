@@ -214,7 +214,11 @@ class ExactTrainer(Trainer):
         grid = self.run.rasterizer.window_grid(sample.crop)
         window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
-        options = {"sh_degree": self._degree, "antialiased": self.config.antialiased, "judge": self._asks}
+        options = {
+            "sh_degree": self._degree,
+            "antialiased": self.config.antialiased,
+            "residual_sums": self._asks,
+        }
         return self.run.rasterizer.draw(gaussians, [shot], **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:

@@ -49,7 +49,7 @@ LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
 """The limits that follow from the device's memory; a run keeps them."""
-COARSE_MODEL = "scaffold_gaussians"
+COARSE_MODEL = "coarse_gaussians"
 """Another, of the warm-up's memory."""
 BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64

@@ -29,7 +29,7 @@ class Controls:
             if trains:
                 self._texts["headline"] = gui.add_markdown("Training has not begun.")
                 self._run = gui.add_progress_bar(0.0)
-                self._texts["sweep"] = gui.add_markdown("")
+                self._texts["epoch"] = gui.add_markdown("")
             self._show = gui.add_dropdown("Show", options=tuple(show.value for show in Show))
             self._block = gui.add_dropdown("Block", options=(FOLLOW,) if trains else ("1",))
             self.boxes = gui.add_checkbox("Boxes", initial_value=trains)

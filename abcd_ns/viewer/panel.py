@@ -156,12 +156,12 @@ class AbcdPanel(ViewerControl):
     def _report(self, coordinator: Trainer) -> None:
         state = coordinator.state
         said = headline(self._where(state), coordinator.progress, time_left(coordinator))
-        sweep = f"Sweep {state.sweep}: {len(state.queue)} visits are waiting" if state.queue else ""
+        epoch = f"Epoch {state.epoch}: {len(state.queue)} visits are waiting" if state.queue else ""
         over = coordinator.finished and not self._stage
         if over and not self._over:
             self._over, self._controls.boxes.value = True, False  # they were about the training
         said = "**Trained.**" if over else said
-        self._controls.write(headline=said, sweep=sweep)
+        self._controls.write(headline=said, epoch=epoch)
         self._controls.progress(coordinator.progress)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:

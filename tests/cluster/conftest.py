@@ -13,7 +13,7 @@ from abcd_ns.engine.train.training_loop import train
 from tests.cluster.in_process import InProcessWorkers
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, price=2.0)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, min_contribution=2.0)
 
 
 @pytest.fixture(scope="session")

@@ -79,7 +79,7 @@ def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos,
 def test_workers_keep_to_the_room_that_harmonics_leave(make, photos, monkeypatch):
     """Which came while blocks in their first visits still grow."""
     monkeypatch.setattr(control, "MOST_NEW", 1.0)
-    density = replace(GROWING, refine_stop=0.2, price=0.0)
+    density = replace(GROWING, refine_stop=0.2, min_contribution=0.0)
     options = {"density": density, "late_harmonics": 2, "block_limit": 30}
     alone, assigned = make("alone", **options), make("lent", workers=1, lag=1, **options)
     for run in (alone, assigned):
@@ -130,7 +130,7 @@ def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(m
     assert most > 1
     assert ended == sorted(ended)
     assert not out
-    assert [event.sweep for event in epochs] == list(range(run.state.sweep + 1))
+    assert [event.epoch for event in epochs] == list(range(run.state.epoch + 1))
     assert run.state.step == 60
 
 

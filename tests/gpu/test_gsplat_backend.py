@@ -66,7 +66,12 @@ def test_sums_of_residuals_and_means2d_gradient(rasterizer, scene, crop):
     infos = []
     for backend in (rasterizer, TorchRasterizer(use_native=False)):
         raster = backend(
-            as_leaves(scene(200)), view(), sh_degree=1, crop=crop, frozen=scene(50, seed=3), judge=True
+            as_leaves(scene(200)),
+            view(),
+            sh_degree=1,
+            crop=crop,
+            frozen=scene(50, seed=3),
+            residual_sums=True,
         )
         raster.info["means2d"].retain_grad()
         weights = probe(*raster.transmittance.shape, dtype=torch.float32).to(raster.color.device)

@@ -57,7 +57,7 @@ def test_what_is_no_number_is_said_at_once(coordinator, capsys):
 
 def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
     coordinator.state.views = {0: 3, 1: 0, 2: 1}
-    coordinator.state.health = {0: BlockHealth(visits=2, giants=3), 2: BlockHealth(visits=1)}
+    coordinator.state.health = {0: BlockHealth(visits=2, oversized=3), 2: BlockHealth(visits=1)}
     ProgressReport(coordinator).close()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("Trained 0 steps in 0 visits")

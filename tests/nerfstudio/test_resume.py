@@ -203,7 +203,7 @@ def test_going_on_for_no_more_steps_completes_the_run(data, stopped, tmp_path):
     assert before.active is not None
     resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped, steps=before.step))
     state = resumed.pipeline.coordinator.state
-    assert (state.active, state.step, state.shed_at) == (None, before.step, before.step)
+    assert (state.active, state.step, state.pruned_at) == (None, before.step, before.step)
 
 
 def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path, capsys):

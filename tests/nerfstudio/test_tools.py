@@ -280,7 +280,7 @@ def test_what_a_user_can_repair_ends_a_tool_in_one_line(
 
 @pytest.mark.usefixtures("trained")
 def test_writers_are_told_where_the_training_stands(events):
-    for name in ("blocks", "sweep", "gaussians", "share of time for layers", "RAM (GiB)"):
+    for name in ("blocks", "epoch", "gaussians", "share of time for layers", "RAM (GiB)"):
         assert f"ABCD/{name}" in events.scalars
     (first, warm_up), *_, (last, block) = events.scalars["ABCD/block"]
     assert (first, warm_up, last) == (0, 0, 20)

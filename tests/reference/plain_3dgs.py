@@ -32,7 +32,10 @@ def train_plain(
             decay = exponential_decay(taken / steps, config.recipe.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share
         raster = draw(
-            Gaussians(**{name: params[name] for name in PARAM_NAMES}), view, sh_degree=degree, judge=True
+            Gaussians(**{name: params[name] for name in PARAM_NAMES}),
+            view,
+            sh_degree=degree,
+            residual_sums=True,
         )
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))

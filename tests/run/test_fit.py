@@ -166,7 +166,7 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():
-    assert coarse_model_size(training_config(scaffold_gaussians=500), 3_333, PIXELS) == 500
+    assert coarse_model_size(training_config(coarse_gaussians=500), 3_333, PIXELS) == 500
 
 
 @pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch": 1, "crop_pixels": 900}])

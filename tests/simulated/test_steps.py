@@ -71,7 +71,7 @@ def test_a_drawing_leaves_nothing_behind(start, views, simulated_gsplat, crop):
     rasterizer, live = GsplatRasterizer(), []
     leaves = as_leaves(start.to(DEVICE))
     for _ in range(3):
-        raster = rasterizer(leaves, views[0], sh_degree=1, crop=crop, judge=True)
+        raster = rasterizer(leaves, views[0], sh_degree=1, crop=crop, residual_sums=True)
         raster.info["sums"].ask([torch.ones(*raster.depth.shape, 4, device=DEVICE)])
         raster.color.sum().backward()
         assert bool(raster.info["sums"].values.any())

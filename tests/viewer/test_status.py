@@ -26,7 +26,7 @@ def test_a_block_is_untrained_then_active_then_done():
         return [status_of(block, state, active) for block in range(5)]
 
     state = RunState(views={0: 9, 1: 9, 2: 2, 3: 0})
-    state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1), 4: BlockHealth(giants=3)}
+    state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1), 4: BlockHealth(oversized=3)}
     few, none = Status.UNDER_OBSERVED, Status.UNTRAINED  # the last one's share of the epoch was no step
     assert statuses(state, 1) == [Status.DONE, Status.ACTIVE, few, few, none]
     assert statuses(state, 0, 3) == [Status.ACTIVE, none, few, Status.ACTIVE, none]
@@ -58,8 +58,8 @@ def test_of_many_blocks_the_table_shows_the_urgent_ones():
     assert lines[-1] == "100 blocks: 1 active, 1 under-observed, 98 untrained."
 
 
-def a_run(step: int, progress: float, price: float = 8.0):
-    density = SimpleNamespace(price=price, strategy="error")
+def a_run(step: int, progress: float, min_contribution: float = 8.0):
+    density = SimpleNamespace(min_contribution=min_contribution, strategy="error")
     return SimpleNamespace(
         config=SimpleNamespace(density=density, recipe=SimpleNamespace(exact=False)),
         state=SimpleNamespace(step=step),
@@ -72,7 +72,7 @@ def a_run(step: int, progress: float, price: float = 8.0):
 
 def test_time_left_is_that_of_steps_and_of_the_final_pruning():
     assert time_left(a_run(step=0, progress=0.0)) is None
-    assert time_left(a_run(step=100, progress=0.25, price=0.0)) == pytest.approx(30.0)
+    assert time_left(a_run(step=100, progress=0.25, min_contribution=0.0)) == pytest.approx(30.0)
     pruning = 0.1 * (12.5 + 0.5 * 7 * 5)  # 400 steps: 12.5 views rank, 5 tell
     assert time_left(a_run(step=100, progress=0.25)) == pytest.approx(30.0 + pruning)
     assert time_left(a_run(step=100, progress=1.0)) == pytest.approx(0.1 * (5 + 0.5 * 7 * 5))

@@ -86,7 +86,7 @@ def _block_row(run: RunFolder, block: int, gaussians: int | None) -> tuple[str, 
     return (
         str(block + 1),
         known(gaussians),
-        known(health[block].shed if block in health else None),
+        known(health[block].pruned if block in health else None),
         known(run.state.views.get(block)),
         str(len(visits)),
         known(seconds or None, "{:.1f} s"),

@@ -131,7 +131,7 @@ class Rasterizer:
         sh_degree: int,
         antialiased: bool = False,
         blend_weights: bool = False,
-        judge: bool = False,
+        residual_sums: bool = False,
     ) -> tuple[Raster, ...]:
         """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
 
@@ -143,7 +143,7 @@ class Rasterizer:
             blend_weights: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's
                 depth is taken from: after backward its gradient is the sum of the Gaussian's weights alpha T,
                 each times the gradient of the pixel's depth; and that changes no other gradient.
-            judge: take residuals, by `info["sums"]`: ResidualSums.
+            residual_sums: take residuals, by `info["sums"]`: ResidualSums.
 
         Raises:
             ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or
@@ -160,7 +160,7 @@ class Rasterizer:
         frozen: Gaussians | None = None,
         z_window: ZWindow | None = None,
         antialiased: bool = False,
-        judge: bool = False,
+        residual_sums: bool = False,
     ) -> Raster:
         """`draw` for a single view and, without `crop`, all of its image."""
         crop = crop or view.full
@@ -168,7 +168,7 @@ class Rasterizer:
         if frozen is not None:
             seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
         shot = Shot(view, crop, seen, z_window)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased, "judge": judge}
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "residual_sums": residual_sums}
         return self.draw(gaussians, [shot], **options)[0]
 
     def cuts(

@@ -112,7 +112,7 @@ def _values_and_gradients(
     own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
     leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
     shots = case.shots(rasterizer, frozen, view)
-    options = {"antialiased": case.antialiased, "blend_weights": case.wants_weights, "judge": True}
+    options = {"antialiased": case.antialiased, "blend_weights": case.wants_weights, "residual_sums": True}
     rasters = rasterizer.draw(Gaussians(**leaves), shots, sh_degree=case.sh_degree, **options)
     infos = list({id(raster.info): raster.info for raster in rasters}.values())
     means2d = [info["means2d"] for info in infos]

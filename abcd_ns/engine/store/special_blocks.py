@@ -10,12 +10,12 @@ BlockName = int | str
 
 WHOLE = "whole"
 """All blocks at once, where a visit names its block; nothing is stored under it."""
-DEFERRED = "reserve"
+DEFERRED = "deferred"
 """Deferred points: Gaussians that join at the end of the warm-up."""
 LIVE = "live"
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
-PENDING = "inbox"
+PENDING = "pending"
 """Pending migrants: Gaussians that left their block and join another at its next visit."""
 
 

@@ -131,9 +131,9 @@ class Coordinator(Trainer):
         self.scene.clear_live()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
-        rest_after_visit(self.run, active, state, updates, self.state.sweep)
+        rest_after_visit(self.run, active, state, updates, self.state.epoch)
         if not active.is_whole and not self.state.queue:
-            self.announce(EpochEnded(self.state.sweep, self.state.step))
+            self.announce(EpochEnded(self.state.epoch, self.state.step))
 
     def complete(self) -> None:
         """Take out what the complete run's pictures hardly miss, where options ask for it and there are
@@ -142,13 +142,13 @@ class Coordinator(Trainer):
         if self.state.active is not None:
             self.end_visit()
         if (
-            self.state.shed_at == self.state.step
+            self.state.pruned_at == self.state.step
             or self._final_pruning is None
             or not self._final_pruning.is_wanted
         ):
             return
         self._final_pruning.run()
-        self.state.shed_at = self.state.step
+        self.state.pruned_at = self.state.step
         self.run.rest(self.scene.tree, {}, 0.0)
 
     def _end_warm_up(self) -> None:
@@ -203,7 +203,7 @@ def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Ite
 
 
 def rest_after_visit(
-    run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], sweep: int
+    run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
 ) -> None:
     """Put what a visit changed to rest, blocks that have outgrown their limit in parts, and tell listeners.
 
@@ -221,7 +221,7 @@ def rest_after_visit(
     run.announce(
         VisitEnded(
             active.number,
-            sweep,
+            epoch,
             block,
             gaussians=staying,
             migrated=len(state) - staying,

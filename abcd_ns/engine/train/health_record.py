@@ -23,9 +23,9 @@ class BlockHealth:
     values: int = 0
     """Gaussians that were no numbers: put back as they were at rest or, where that is not known, replaced by
     transparent ones."""
-    giants: int = 0
+    oversized: int = 0
     """Gaussians that were shrunk."""
-    shed: int = 0
+    pruned: int = 0
     """Gaussians that filled too little of their views and were taken out."""
     hidden: bool = False
     """In the last visit no picture showed the block."""
@@ -74,8 +74,8 @@ REPAIRED = {
     "gradients": "gradients that were no numbers set to zero",
     "moments": "moments that were no numbers set to zero",
     "values": "Gaussians that were no numbers replaced",
-    "giants": "oversized Gaussians shrunk",
-    "shed": "Gaussians taken out that filled too little of their views",
+    "oversized": "oversized Gaussians shrunk",
+    "pruned": "Gaussians taken out that filled too little of their views",
 }
 """What the counts of a BlockHealth say."""
 

@@ -150,7 +150,7 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
     visit, warm_up = (needs_of(config, pixels, blocks) for blocks in (2, 1))
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
-    return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
+    return config.limits.coarse_gaussians or room // warm_up.gaussian_bytes
 
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | None = None) -> DeviceNeeds:

@@ -114,7 +114,7 @@ class Planner(Visits):
         run, live = self._run, len(self._run.params["means"])
         if run.active.is_whole:
             deferred, limit = self._scene.rows(DEFERRED), self._config.density.limit
-            most = self._config.limits.scaffold_gaussians
+            most = self._config.limits.coarse_gaussians
             return (most if limit is None else min(most, limit - deferred)) - live
         return self._config.room(run.count(), live, run.limits.of_block(run.blocks))
 
@@ -213,7 +213,7 @@ class Planner(Visits):
         if not state.views:
             state.views = self._views_of_blocks(state)
         else:
-            state.sweep += 1
+            state.epoch += 1
             self._look_at_arrivals(state)
         if not any(state.views.values()):
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
@@ -221,13 +221,13 @@ class Planner(Visits):
         used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
         blocks = self._scene.tree.num_blocks
         passes = passes_of_visit(config.recipe.passes, max(used.values()), at_once, blocks)
-        if state.sweep % LOOK_AGAIN:
+        if state.epoch % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
         steps = (passes, remaining, config.seed, config.recipe.visit_steps)
         clocks = self._scene.clocks
         batches = {block: views_of_step(config, blocks, clocks(block).adam_views) for block in used}
-        state.queue = list(plan_epoch(state.sweep, used, *steps, batches))
+        state.queue = list(plan_epoch(state.epoch, used, *steps, batches))
 
     def _look_at_arrivals(self, state: RunState) -> None:
         """A block that no view saw may be seen once others have come into it."""

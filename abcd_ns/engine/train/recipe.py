@@ -47,7 +47,7 @@ class Recipe:
     paper; frozen blocks are then drawn with the highest."""
     sh_ramp: float = 0.1
     """Share of the run over which the degree rises from 0 to the highest."""
-    heal: bool = True
+    limit_scales: bool = True
     """Shrink oversized Gaussians where blocks are trained within layers, and let none grow.
     Non-finite values are repaired in any case."""
     means_lr_decay: float = 0.1
@@ -76,7 +76,7 @@ class Limits:
     crop_pixels: int = 0
     """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
     another one each time, and weighs it by how much of the crop it leaves out."""
-    scaffold_gaussians: int = 0
+    coarse_gaussians: int = 0
     """Gaussians of the warm-up's coarse model at most, see `memory.coarse_model_size`; 0 is as many as there
     are in the beginning."""
     late_harmonics: int = 0

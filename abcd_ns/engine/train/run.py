@@ -63,7 +63,7 @@ class TrainingRun:
         if light is None and config.light != "none":
             self.light = Light(config.light, list(self.views), self.device)
         self.poses = Poses(views)
-        may_act = config.recipe.heal and config.recipe.layers
+        may_act = config.recipe.limit_scales and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.density = DensityControl(config.density, rasterizer.primitive)
 

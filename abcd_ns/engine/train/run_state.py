@@ -129,7 +129,7 @@ class RunState:
     """Optimisation steps taken in the whole scene."""
     sh_degree: int = 0
     """Of spherical harmonics, that any block has come to."""
-    sweep: int = 0
+    epoch: int = 0
     visit: int = 0
     """Visits begun so far."""
     queue: list[VisitPlan] = field(default_factory=list)
@@ -144,7 +144,7 @@ class RunState:
     """Of each view by the whole scene, so far; counted where poses are refined. A block is its part of it."""
     posed: float = 0.0
     """Uses after which poses were last refined."""
-    shed_at: int = -1
+    pruned_at: int = -1
     """Steps after which the final pruning was done."""
     health: HealthByBlock = field(default_factory=dict)
     """What had to be repaired, by block."""

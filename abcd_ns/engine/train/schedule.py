@@ -82,7 +82,7 @@ def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
 
 
 def plan_epoch(
-    sweep: int,
+    epoch: int,
     views: Mapping[int, int],
     passes: int | float,
     remaining: int | None,
@@ -90,7 +90,7 @@ def plan_epoch(
     each: int = 0,
     batches: Mapping[int, int] | None = None,
 ) -> tuple[VisitPlan, ...]:
-    """The visits of one epoch, in a random order that depends on `seed` and `sweep` alone.
+    """The visits of one epoch, in a random order that depends on `seed` and `epoch` alone.
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
@@ -103,7 +103,7 @@ def plan_epoch(
     batches = batches or {}
     seen = {block: count for block, count in sorted(views.items()) if count > 0}
     order = list(seen)
-    random.Random(f"sweep {seed} {sweep}").shuffle(order)
+    random.Random(f"sweep {seed} {epoch}").shuffle(order)
     most = max(batches.values(), default=1)
     weights = {block: 1 if each else count * most // batches.get(block, 1) for block, count in seen.items()}
     steps = {b: each or math.ceil(passes * count / batches.get(b, 1)) for b, count in seen.items()}

@@ -34,29 +34,29 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
         coordinator.await_step()
         return
 
-    def judge(part: Batch, rendered: Rendered) -> Judgement:
+    def assess(part: Batch, rendered: Rendered) -> Judgement:
         read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in part.samples)
         photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
         errors = squared_errors(rendered.pictures, photos)
         return coordinator.loss(part, rendered.pictures, photos), errors
 
-    take_step(coordinator, coordinator.optimizers, judge)
+    take_step(coordinator, coordinator.optimizers, assess)
 
 
 def take_step(
-    training: Trainer | VisitTraining, optimizers: Optimizers, judge: Callable[[Batch, Rendered], Judgement]
+    training: Trainer | VisitTraining, optimizers: Optimizers, assess: Callable[[Batch, Rendered], Judgement]
 ) -> None:
     """Draw a step's parts and take the gradients of their losses, one after the other; step every optimizer.
 
     Args:
-        judge: of a part, and of what was drawn of it.
+        assess: of a part, and of what was drawn of it.
     """
     batch, drawn, errors = training.next_batch(), [], []
     for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     for part in batch.parts():
         rendered = training.render(part)
-        loss, found = judge(part, rendered)
+        loss, found = assess(part, rendered)
         drawn.append(rendered.kept)
         errors.extend(found)
         if loss.requires_grad:

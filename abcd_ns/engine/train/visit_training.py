@@ -83,7 +83,7 @@ class VisitTraining:
         gaussians, self.influence = len(self.live), None
         if active.is_whole:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
-        run.announce(VisitBegan(active.number, state.sweep, block, active.steps, seen, gaussians))
+        run.announce(VisitBegan(active.number, state.epoch, block, active.steps, seen, gaussians))
         before = run.stopwatch.seconds
         # None where nobody knows how many steps it will have, and its views are drawn in turn.
         taken = 0 if active.is_alone else active.steps * self.batch
@@ -162,7 +162,7 @@ class VisitTraining:
         judged = self._residuals.found()
         self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
-            self.live.judge()
+            self.live.prune()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
@@ -206,7 +206,7 @@ class VisitTraining:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
         if not active.is_all and not self.live.is_new:
-            self.live.judge()
+            self.live.prune()
         self.live.end_visit(counts=not active.is_whole)
         state = self.run.health.end_visit(self.live.detached)
         self.layers = None
@@ -256,7 +256,7 @@ class VisitTraining:
             sh_degree=min(self.degree, live.sh_degree),  # by time, it may have risen since `next_batch`
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
-            judge=run.density.asks(run.share, first=self.live.clocks.visits == 0),
+            residual_sums=run.density.asks(run.share, first=self.live.clocks.visits == 0),
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         views = tuple(sample.view for sample in samples)

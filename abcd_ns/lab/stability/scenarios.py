@@ -115,7 +115,7 @@ RISES_BY = 1e-3
 def old_layers(lab: Lab) -> Finding:
     """A13: the objective after each visit."""
     stage = make_stage(views=ring(12), points=400)
-    usual = {"budget": BUDGET // 2, "warmup": 0.0, "recipe": Recipe(heal=False, passes=2)}
+    usual = {"budget": BUDGET // 2, "warmup": 0.0, "recipe": Recipe(limit_scales=False, passes=2)}
     usual["density"] = DensityConfig(strategy="off")
     coordinator = lab.coordinator(stage, **usual)
     errors = [full_error(lab, stage, coordinator.scene.everything("cpu"))]

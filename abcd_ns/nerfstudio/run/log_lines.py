@@ -60,7 +60,7 @@ class VisitEndLine(Line):
     """A visit ended and its block is at rest."""
 
     visit: int
-    sweep: int
+    epoch: int
     block: int | None
     gaussians: int
     """In the block, after migration."""
@@ -127,18 +127,18 @@ KINDS: dict[str, type[Line]] = {
     "visit": VisitLine,
     "sample": SampleLine,
     "visit end": VisitEndLine,
-    "sweep end": EpochEndLine,
+    "epoch end": EpochEndLine,
     "worker lost": WorkerLostLine,
     "worker": WorkerLine,
-    "shed at end": PrunedAtEndLine,
+    "pruned at end": PrunedAtEndLine,
     "held out": HeldOutLine,
     "end": EndLine,
 }
 """By the value of a line's field "kind"."""
 KIND_OF = {
     VisitBegan: "visit",
-    EpochEnded: "sweep end",
+    EpochEnded: "epoch end",
     WorkerLost: "worker lost",
-    PrunedAtEnd: "shed at end",
+    PrunedAtEnd: "pruned at end",
 }
 """By what of the engine's events is a line as it is."""

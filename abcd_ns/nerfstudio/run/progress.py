@@ -70,7 +70,7 @@ class ProgressReport:
             case StepTaken():
                 self._take_step(event)
             case EpochEnded() if self._coordinator.scene.tree.num_blocks > 1:
-                self._print(f"epoch {event.sweep} done at step {event.step:,}: {self._summary()}")
+                self._print(f"epoch {event.epoch} done at step {event.step:,}: {self._summary()}")
             case HeldOutScored():
                 self._held_out = event
             case Pruning():
@@ -94,7 +94,7 @@ class ProgressReport:
         found = {
             "block": 0 if block is None else block + 1,
             "blocks": coordinator.scene.tree.num_blocks,
-            "sweep": coordinator.state.sweep,
+            "epoch": coordinator.state.epoch,
             "gaussians": coordinator.count(),
             "share of time for layers": layer_share(self._visits),
             "RAM (GiB)": psutil.Process().memory_info().rss / GIB,

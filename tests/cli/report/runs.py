@@ -54,7 +54,7 @@ def log_lines() -> list[str]:
         end = {"visit": visit, "block": block, "layer_seconds": 1.0, "visit_seconds": 4.0}
         lines.append(line("visit end", began + 10, 4.0 * visit + 4, psnr=20.0 + visit, **end))
     lines.append(line("held out", 40, 16.0, psnr=24.5, ssim=0.75))
-    return [*lines, line("sweep end", 40, 16.0, sweep=0)]
+    return [*lines, line("epoch end", 40, 16.0, epoch=0)]
 
 
 def write_log(path: Path, lines: list[str]) -> Path:

@@ -127,7 +127,7 @@ def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_an
     shed = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
     ends = [{"worker": 0, "deaths": 1, "waited": 0.25}, {"worker": 1, "deaths": 0, "waited": 0.05}]
     lines = [line("worker", 40, 16.0, visits=2, **end) for end in ends]
-    found = with_lines(run, *lines, line("shed at end", 40, 17.0, **shed))
+    found = with_lines(run, *lines, line("pruned at end", 40, 17.0, **shed))
     assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
     figures = more_figures(found, None)
     assert figures["workers"] == "2, waited 15% of the time, 1 lost"
@@ -217,7 +217,7 @@ def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
 
 
 def test_blocks_say_how_they_were_trained_or_why_not(tmp_path):
-    state = RunState(health={0: BlockHealth(visits=1, shed=1234), 1: BlockHealth()}, views={0: 4})
+    state = RunState(health={0: BlockHealth(visits=1, pruned=1234), 1: BlockHealth()}, views={0: 4})
     run = dataclasses.replace(made_up_run(tmp_path), state=state)
     first, second, third = block_rows(run)
     assert first[:5] == ("1", "200", "1,234", "4", "1")

@@ -79,7 +79,7 @@ def test_fewer_harmonics_are_taken_as_they_are(sh_degree):
 @BOTH
 def test_several_views_what_each_counts_and_weighs(primitive):
     shots = [Shot(VIEW, VIEW.full), Shot(VIEW, Crop(9, 8, 30, 20)), Shot(VIEW, Crop(40, 0, 43, 61))]
-    for options in ({"judge": True}, {"judge": True, "blend_weights": True}):
+    for options in ({"residual_sums": True}, {"residual_sums": True, "blend_weights": True}):
         found = []
         for draw in pair(primitive):
             leaves = as_leaves(SCENE)

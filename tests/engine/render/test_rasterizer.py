@@ -120,7 +120,7 @@ def test_residuals_are_summed_by_weight_and_place():
         )
 
     shot = Shot(VIEW, crop, EAGER.project(frozen, VIEW))
-    (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1, judge=True)
+    (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1, residual_sums=True)
     raster.info["sums"].ask([residual])
     raster.color.sum().backward()
     assert raster.info["sums"].values.shape == (1, 6, 10)

@@ -145,7 +145,7 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
     for draws in (backend, torch_twin(backend, TILE)):
         leaves = as_leaves(random_gaussians(40))
         shots = several_shots(torch_twin(backend, TILE), windowed, with_frozen)
-        rasters = draws.draw(leaves, shots, sh_degree=2, judge=True)
+        rasters = draws.draw(leaves, shots, sh_degree=2, residual_sums=True)
         infos = {id(raster.info): raster.info for raster in rasters}
         for info in infos.values():
             info["means2d"].retain_grad()
@@ -216,7 +216,7 @@ def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
     assert bool((window.near == window.far).all())
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
-    rasters = backend.draw(leaves, shots, sh_degree=3, judge=True)
+    rasters = backend.draw(leaves, shots, sh_degree=3, residual_sums=True)
     sum(stacked(raster).sum() for raster in rasters).backward()
     assert bool((rasters[0].transmittance == 1).all())
     assert rasters[0].info["means2d"].shape == (2, 0, 2)

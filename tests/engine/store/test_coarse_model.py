@@ -15,7 +15,7 @@ from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
 from tests.reference.scenes import STILL, assert_resumes, listen, whole_scene
 
-GROWING = replace(scenes.GROWING, price=0.0)
+GROWING = replace(scenes.GROWING, min_contribution=0.0)
 LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 """Enough for growth."""
 
@@ -74,7 +74,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(make, photos):
 
 
 def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, photos):
-    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.25, density=STILL, heal=False)
+    coordinator = make(blocks=4, steps=40, coarse_model=30, warmup=0.25, density=STILL, limit_scales=False)
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
     assert len(whole_scene(coordinator)) == 30
@@ -106,7 +106,7 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
 @pytest.mark.parametrize("most", [0, 125, 400])
 def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
-    coordinator = make(**LONG, coarse_model=len(start), scaffold_gaussians=most, density=GROWING)
+    coordinator = make(**LONG, coarse_model=len(start), coarse_gaussians=most, density=GROWING)
     train(coordinator, photos, steps=29)
     live = len(coordinator.params["means"])
     assert live == coordinator.count()
@@ -119,7 +119,7 @@ def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, 
 
 def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
     density = replace(GROWING, max_gaussians=len(start))
-    coordinator = make(**LONG, coarse_model=60, scaffold_gaussians=100, density=density)
+    coordinator = make(**LONG, coarse_model=60, coarse_gaussians=100, density=density)
     train(coordinator, photos, steps=29)
     assert len(coordinator.params["means"]) <= 60
 
@@ -150,7 +150,7 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
 
 
 def test_a_visit_in_which_deferred_points_join_prunes_none(make, photos):
-    density = replace(GROWING, price=1e9, refine_stop=0.0)
+    density = replace(GROWING, min_contribution=1e9, refine_stop=0.0)
     coordinator = make(blocks=2, steps=400, coarse_model=30, warmup=0.1, density=density)
     ended, counts = listen(coordinator, VisitEnded), {}
     while len(ended) < 4:

@@ -329,7 +329,7 @@ def test_one_block_is_one_visit(make, photos):
     (begun,) = (event for event in events if isinstance(event, VisitBegan))
     (ended,) = (event for event in events if isinstance(event, VisitEnded))
     assert (begun.steps, begun.views, ended.block) == (50, 5, 0)
-    assert [event.sweep for event in events if isinstance(event, EpochEnded)] == [0]
+    assert [event.epoch for event in events if isinstance(event, EpochEnded)] == [0]
     assert [(written, state["step"]) for written, state in disk.commits] == [({0}, 50)]
 
 

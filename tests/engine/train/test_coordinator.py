@@ -49,7 +49,7 @@ def test_training_improves_every_photo(make, views, photos, primitive):
 
 @pytest.mark.parametrize(("growing", "layers"), [(True, True), (False, False)], ids=["growing", "ablated"])
 def test_one_block_is_plain_3dgs_bit_for_bit(make, views, photos, start, growing, layers):
-    density = replace(GROWING, price=0.0) if growing else STILL
+    density = replace(GROWING, min_contribution=0.0) if growing else STILL
     coordinator = make(blocks=1, steps=40, density=density, layers=layers, fast_start=True)
     train(coordinator, photos)
     expected = train_plain(start, views, photos, steps=40, config=coordinator.config)
@@ -194,7 +194,7 @@ def test_events_tell_the_whole_story(make, photos):
     begun = [e for e in events if isinstance(e, VisitBegan)]
     assert kinds.count(StepTaken) == 45 == sum(e.steps for e in begun)
     assert kinds.count(VisitBegan) == kinds.count(VisitEnded) == coordinator.state.visit
-    assert kinds.count(EpochEnded) == coordinator.state.sweep + 1
+    assert kinds.count(EpochEnded) == coordinator.state.epoch + 1
     assert {e.block for e in begun} == {0, 1, 2}
     for visit in begun:
         drawn = [e for e in events if isinstance(e, LayersDrawn) and e.visit == visit.visit]
@@ -204,7 +204,7 @@ def test_events_tell_the_whole_story(make, photos):
 
 def test_a_limit_on_gaussians_is_kept_at_every_step(make, photos, start):
     limit = len(start) + 15
-    density = replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0, price=0.0)
+    density = replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0, min_contribution=0.0)
     coordinator = make(blocks=2, steps=60, density=density)
     counts = []
     while not coordinator.finished:

@@ -20,7 +20,7 @@ from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians, View
 from tests.reference.scenes import Photos, assert_resumes, random_gaussians, ring_of_views, whole_scene
 
-STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
+STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, min_contribution=1e-9)
 """Nothing grows, and nobody is pruned that fills anything."""
 COEFFICIENTS = (1, 4, 9, 16)
 
@@ -40,7 +40,7 @@ def look(mean: torch.Tensor, size: float, view: View) -> tuple[np.ndarray, float
     return basis, float(view.K[0, 0] / z) ** 2 if seen else 0.0
 
 
-def slow(gaussians: Gaussians, row: int, views: list[View], weight: float, price: float):
+def slow(gaussians: Gaussians, row: int, views: list[View], weight: float, cost: float):
     """(degree, coefficients [16, 3]) of one Gaussian, by least squares over a list of views."""
     mean, size = gaussians.means[row].double(), float(gaussians.scales[row].max().exp())
     looks = [look(mean, size, view.to(torch.float64)) for view in views]
@@ -54,19 +54,19 @@ def slow(gaussians: Gaussians, row: int, views: list[View], weight: float, price
         fitted = np.zeros_like(c)
         fitted[:kept] = np.linalg.lstsq(system, target, rcond=None)[0]
         square = ((A @ (fitted - c)) ** 2).sum() / 3
-        found.append((weight * square + price * 3 * (kept - 1), degree, fitted))
+        found.append((weight * square + cost * 3 * (kept - 1), degree, fitted))
     return min(found, key=lambda each: each[0])[1:]
 
 
-@pytest.mark.parametrize(("price", "count"), [(0.0, 12), (1e-5, 12), (3e-3, 12), (3e-2, 12), (3e-2, 1)])
-def test_every_gaussian_gets_what_a_list_of_views_says(price, count, monkeypatch):
+@pytest.mark.parametrize(("cost", "count"), [(0.0, 12), (1e-5, 12), (3e-3, 12), (3e-2, 12), (3e-2, 1)])
+def test_every_gaussian_gets_what_a_list_of_views_says(cost, count, monkeypatch):
     """Seen from one place, a colour is all that there is."""
-    monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
+    monkeypatch.setattr(degrees, "NUMBER_COST", cost)
     monkeypatch.setattr(degrees, "AT_ONCE", 3 * 16 * 16)  # several parts
     gaussians, views = random_gaussians(20, seed=3, sh_degree=3), ring_of_views(count)
     found = lowered(gaussians, statistics(20), views, gaussians.sh_degree)
     for row in range(20):
-        degree, expected = slow(gaussians, row, views, 30.0, price)
+        degree, expected = slow(gaussians, row, views, 30.0, cost)
         assert int(found.gone[row]) == 3 - degree
         values = torch.cat((found.features_dc[row][None], found.features_rest[row])).double().numpy()
         np.testing.assert_allclose(values, expected, atol=1e-3)
@@ -153,7 +153,7 @@ def test_degrees_go_in_the_later_half_and_stay_away(make, photos, blocks):
 
 
 def test_where_nothing_is_weighed_every_degree_stays(make, photos):
-    coordinator = make(blocks=2, steps=30, density=replace(STILL, price=0.0))
+    coordinator = make(blocks=2, steps=30, density=replace(STILL, min_contribution=0.0))
     train(coordinator, photos)
     assert coordinator.scene.parameters() == 120 * 38
 
@@ -169,6 +169,6 @@ def test_a_visit_that_draws_each_view_once_is_enough_to_judge_by(make, photos, t
         train_step(coordinator, photos)
     live.growth = {**live.growth, **statistics(len(live))}
     assert live.growth["passes"].tolist() == [1.0] * len(live)
-    live.judge()
+    live.prune()
     assert float(live.growth[GONE].max()) > 0
     assert live.growth["passes"].tolist() == [0.5] * len(live)

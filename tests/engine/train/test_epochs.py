@@ -27,10 +27,10 @@ def test_who_is_hidden_is_no_part_of_an_epoch_until_looked_at_again(make, photos
         before = len(ended)
         while len(ended) == before:
             train(coordinator, photos, steps=1)
-        sweep = ended[-1].sweep
-        assert sweep == before
-        expected = {block} if sweep % LOOK_AGAIN else {0, 1, 2, 3}
-        assert {visit.block for visit in began if visit.sweep == sweep} == expected
+        epoch = ended[-1].epoch
+        assert epoch == before
+        expected = {block} if epoch % LOOK_AGAIN else {0, 1, 2, 3}
+        assert {visit.block for visit in began if visit.epoch == epoch} == expected
         coordinator.state.health.clear()
 
 
@@ -123,7 +123,9 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photo
 
 
 def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make, photos):
-    density = DensityConfig(refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, price=0)
+    density = DensityConfig(
+        refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, min_contribution=0
+    )
     coordinator = make(blocks=2, steps=60, coarse_model=40, visit_steps=8, density=density)
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:

@@ -16,7 +16,7 @@ from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
 
-STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
+STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, min_contribution=1e-9)
 """Nothing grows, and training prunes nobody that fills anything."""
 VIEWS, FAINT = 5, 30
 """Fewer views than a final pruning looks at: it looks at all of them."""
@@ -74,7 +74,7 @@ def test_as_many_go_as_training_views_can_spare(complete, views, photos, monkeyp
     with monkeypatch.context() as patched:
         patched.setattr(FinalPruning, "is_wanted", False)
         all_of_it, _ = complete("all", **options)
-    coordinator, told = complete("shed", **options)
+    coordinator, told = complete("pruned", **options)
     found = at_end(told)
     assert found.gone >= FAINT // 3
     assert coordinator.count() == found.gaussians == len(whole_scene(coordinator))
@@ -117,7 +117,7 @@ def test_what_is_opaque_is_not_taken_for_what_does_not_show(complete):
     assert int((whole_scene(coordinator).opacities > 8).sum()) == opaque
 
 
-@pytest.mark.parametrize("density", [{"price": 0.0}, {"strategy": "off"}])
+@pytest.mark.parametrize("density", [{"min_contribution": 0.0}, {"strategy": "off"}])
 def test_options_keep_everything(complete, density):
     coordinator, told = complete(steps=10, density=replace(STILL, **density))
     assert coordinator.count() == 120
@@ -180,7 +180,7 @@ def test_a_run_whose_time_is_up_between_two_looks_is_complete_all_the_same(begin
 
 def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian(complete, views):
     """In the mean over many signs, of a Gaussian at a time."""
-    coordinator, _ = complete(steps=5, density=replace(STILL, price=0.0))
+    coordinator, _ = complete(steps=5, density=replace(STILL, min_contribution=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, views[0]
     whole = coordinator._final_pruning._whole
     probed, signs = _Probe(), random_signs(0)

@@ -20,7 +20,7 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference import scenes
 from tests.reference.scenes import STILL, equal, listen, random_gaussians, stop, whole_scene
 
-GROWING = replace(scenes.GROWING, price=0.0)
+GROWING = replace(scenes.GROWING, min_contribution=0.0)
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
@@ -41,7 +41,9 @@ def test_a_healthy_run_is_the_same_with_and_without(make, photos, monkeypatch):
     for watched in (True, False):
         if not watched:
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
-        coordinator = make(str(watched), heal=watched, blocks=2, steps=18, density=GROWING, coarse_model=120)
+        coordinator = make(
+            str(watched), limit_scales=watched, blocks=2, steps=18, density=GROWING, coarse_model=120
+        )
         told = listen(coordinator, Repaired)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
@@ -109,7 +111,7 @@ def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make
         scales[2] = 5.0  # spared
     told, kept = listen(coordinator, Repaired), scales[2:].clone()
     coordinator.health.shrink_oversized(views, torch.arange(len(scales)) == 2)
-    assert [(event.what, event.count) for event in told] == [("giants", 1)]
+    assert [(event.what, event.count) for event in told] == [("oversized", 1)]
     nearest = min(float((means[0] - view.center).norm()) for view in views)
     limit = health_rules.OVERSIZED_ANGLE * nearest
     assert scales[0].tolist() == pytest.approx([math.log(limit), -3.0, math.log(limit)])
@@ -125,7 +127,7 @@ def test_oversized_gaussians_shrink_before_their_block_is_trained_and_none_grows
     coordinator = make(blocks=blocks, steps=20, warmup=0.0, density=STILL)
     told = listen(coordinator, Repaired)
     train(coordinator, photos, steps=18)
-    assert {event.what for event in told} == {"giants"}
+    assert {event.what for event in told} == {"oversized"}
     told.clear()
     with torch.no_grad():
         coordinator.params["scales"][1] = 5.0

@@ -10,7 +10,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
-PRICED = DensityConfig(price=1.0, refine_every=1000)
+PRICED = DensityConfig(min_contribution=1.0, refine_every=1000)
 
 
 @pytest.fixture

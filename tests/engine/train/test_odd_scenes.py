@@ -46,7 +46,7 @@ def test_a_block_inside_an_opaque_ball_is_visited_once_and_then_passed_over(tmp_
     options = {"tree": tree, "warmup": 0.0, "passes": 1, "density": DensityConfig(strategy="off")}
     coordinator = make_coordinator(tmp_path, Gaussians.cat([wall, inside]), views, steps=10_000, **options)
     photos = Photos(wall, views)
-    while coordinator.state.sweep < 2:
+    while coordinator.state.epoch < 2:
         train_step(coordinator, photos)
     assert coordinator.state.health[core].hidden
     assert coordinator.scene.clocks(core).visits == 1

@@ -12,7 +12,7 @@ from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
 
-GROWING = {"refine_start": 0.0, "refine_every": 5, "split_pixels": 1.0, "price": 2.0}
+GROWING = {"refine_start": 0.0, "refine_every": 5, "split_pixels": 1.0, "min_contribution": 2.0}
 OTHERS = {
     "primitive": "2dgs",
     "sh_degree": 2,
@@ -29,7 +29,7 @@ OTHERS = {
 OTHERS_OF_DENSITY = {
     "strategy": "mcmc",
     "max_gaussians": 125,
-    "price": 0.0,
+    "min_contribution": 0.0,
     "split_pixels": 1e4,
     "refine_start": 0.3,
     "refine_stop": 0.1,

@@ -20,7 +20,7 @@ from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
-"""Nothing grows, and the price is the full one from the beginning."""
+"""Nothing grows, and the minimum is the full one from the beginning."""
 HIDDEN = 20
 
 
@@ -38,15 +38,17 @@ def some_hidden() -> Gaussians:
 @given(
     weight=st.lists(st.floats(0, 100), min_size=1, max_size=20),
     views=st.integers(1, 50),
-    price=st.floats(0, 20),
+    min_contribution=st.floats(0, 20),
     looks=st.integers(0, 200),
 )
-def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weight, views, price, looks):
-    found = (contributions(statistics(weight, [looks / views] * len(weight))) <= price).tolist()
+def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_minimum(
+    weight, views, min_contribution, looks
+):
+    found = (contributions(statistics(weight, [looks / views] * len(weight))) <= min_contribution).tolist()
     for value, goes in zip(weight, found, strict=True):
         per_view = value / max(looks, 1)
-        if abs(per_view * views - price) > 1e-3:
-            assert goes == (looks >= views and per_view * views < price)
+        if abs(per_view * views - min_contribution) > 1e-3:
+            assert goes == (looks >= views and per_view * views < min_contribution)
 
 
 @given(
@@ -104,14 +106,14 @@ def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(
 
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, blocks):
-    density = replace(STILL, price=1.0)
+    density = replace(STILL, min_contribution=1.0)
     coordinator = make(start=some_hidden(), blocks=blocks, steps=80, density=density, batch=1)
     told = listen(coordinator, Repaired)
     train(coordinator, photos)
     left = whole_scene(coordinator)
     gone = 120 - len(left)
-    assert sum(event.count for event in told if event.what == "shed") == gone
-    assert sum(record.shed for record in coordinator.state.health.values()) == gone
+    assert sum(event.count for event in told if event.what == "pruned") == gone
+    assert sum(record.pruned for record in coordinator.state.health.values()) == gone
     assert HIDDEN / 2 < gone < 2 * HIDDEN
     assert float(left.means[:, 2].max()) < 40
     contributions = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(
@@ -124,7 +126,7 @@ def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_prunes(make, 
     start = random_gaussians(60, seed=7, size=0.12)
     faint = torch.arange(60) % 3 == 0
     start = replace(start, opacities=torch.where(faint[:, None], -6.0, 1.0))  # a sigmoid of 1/404
-    coordinator = make(start=start, blocks=2, steps=12, density=replace(STILL, price=1e-6))
+    coordinator = make(start=start, blocks=2, steps=12, density=replace(STILL, min_contribution=1e-6))
     train(coordinator, photos)
     left = whole_scene(coordinator)
     assert len(left) == 40
@@ -138,20 +140,20 @@ def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(p
     params, optimizers = nothing_live(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     growth = {**statistics(contributions, [1.0] * 9), "count": torch.ones(9)}
-    DensityControl(DensityConfig(price=1.0)).prune(params, optimizers, growth, progress)
+    DensityControl(DensityConfig(min_contribution=1.0)).prune(params, optimizers, growth, progress)
     left = [each for each in range(9) if each not in gone]
     assert params["means"].tolist() == gaussians.means[left].tolist()
 
 
 def test_without_a_price_everything_stays(make, photos):
-    coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, price=0.0))
+    coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, min_contribution=0.0))
     train(coordinator, photos)
     assert coordinator.count() == 120
 
 
 def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     """Those of a step are the weights of the block's Gaussians in pictures of the whole scene."""
-    coordinator = make(blocks=2, density=replace(STILL, price=1e-9), batch=1)
+    coordinator = make(blocks=2, density=replace(STILL, min_contribution=1e-9), batch=1)
     batch, before = coordinator.next_batch(), whole_scene(coordinator)
     block = coordinator.run.active.geometry.block
     (sample,) = batch.samples
@@ -167,7 +169,7 @@ def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
 
 def test_one_block_prunes_after_every_so_many_passes(make, views, photos):
     first, counts = PASSES * len(views), []
-    density = replace(STILL, price=1e-9)
+    density = replace(STILL, min_contribution=1e-9)
     coordinator = make(start=some_hidden(), blocks=1, steps=3 * first, density=density, batch=1)
     while not coordinator.finished:
         train_step(coordinator, photos)

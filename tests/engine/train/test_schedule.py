@@ -23,9 +23,9 @@ from abcd_ns.engine.train.schedule import (
 VIEWS = st.dictionaries(st.integers(0, 30), st.integers(0, 200), min_size=1, max_size=12)
 
 
-@given(views=VIEWS, passes=st.integers(1, 6), sweep=st.integers(0, 50), seed=st.integers(0, 5))
-def test_an_epoch_visits_every_seen_block_once_in_proportion_to_its_views(views, passes, sweep, seed):
-    plans = plan_epoch(sweep, views, passes, None, seed)
+@given(views=VIEWS, passes=st.integers(1, 6), epoch=st.integers(0, 50), seed=st.integers(0, 5))
+def test_an_epoch_visits_every_seen_block_once_in_proportion_to_its_views(views, passes, epoch, seed):
+    plans = plan_epoch(epoch, views, passes, None, seed)
     assert {p.block: p.steps for p in plans} == {b: passes * n for b, n in views.items() if n > 0}
     assert len(plans) == len({p.block for p in plans})
 

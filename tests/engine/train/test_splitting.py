@@ -67,7 +67,7 @@ def test_a_part_is_visited_next_to_the_block_it_came_from():
 
 
 def test_a_part_has_had_the_visits_of_the_block_it_came_from():
-    state = RunState(health={0: BlockHealth(visits=3, shed=7)})
+    state = RunState(health={0: BlockHealth(visits=3, pruned=7)})
     state.inherit(2, 0)
     state.inherit(3, 1)
     assert state.health.keys() == {0, 2}

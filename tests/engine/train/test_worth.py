@@ -48,7 +48,7 @@ def judged(gaussians: Gaussians, photo_of, draw=DRAW) -> torch.Tensor:
     growth = {}
     for view in VIEWS:
         leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
-        (raster,) = draw.draw(leaves, [Shot(view, view.full)], sh_degree=0, judge=True)
+        (raster,) = draw.draw(leaves, [Shot(view, view.full)], sh_degree=0, residual_sums=True)
         residual = (photo_of(view) - raster.color).detach()
         raster.info["sums"].ask([torch.cat((residual, torch.ones_like(residual[..., :1])), dim=-1)])
         raster.color.sum().backward()

@@ -84,13 +84,13 @@ def test_every_method_with_every_seed_block_count_and_change_has_a_folder_of_its
 
 
 def test_changes_are_arms_beside_the_method_as_it_is(tmp_path):
-    vary = "training.density.price=0.5", "partition=grid blocks=27"
+    vary = "training.density.min_contribution=0.5", "partition=grid blocks=27"
     plan = make_plan(options(tmp_path, blocks=(4,), vary=vary))
     assert names_of(plan) == [("abcd", name) for name in ("default", *vary)]
     configs = [trainer_config(job, tmp_path).pipeline for job in plan.jobs]
-    assert configs[1].training.density.price == 0.5
+    assert configs[1].training.density.min_contribution == 0.5
     assert [c.blocks for c in configs] == [4, 4, 27]
-    assert "--vary training.density.price=0.5 'partition=grid blocks=27'" in plan.command
+    assert "--vary training.density.min_contribution=0.5 'partition=grid blocks=27'" in plan.command
 
 
 @pytest.mark.parametrize(

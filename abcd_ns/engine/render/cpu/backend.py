@@ -65,7 +65,7 @@ class TorchRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         blend_weights: bool = False,
-        judge: bool = False,
+        residual_sums: bool = False,
         absgrad: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once.
@@ -91,7 +91,7 @@ class TorchRasterizer(Rasterizer):
         pictures, sums = lists.composite(planes, means2d, weights)
         info: dict[str, Any] = {"means2d": means2d, "radii": planes[:, -1].detach().int()}
         info |= {"weights": weights} if blend_weights else {}
-        info |= {"sums": sums} if judge else {}
+        info |= {"sums": sums} if residual_sums else {}
         return tuple(Raster(*picture, info) for picture in pictures)
 
     @torch.no_grad()

@@ -70,7 +70,7 @@ class GsplatRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         blend_weights: bool = False,
-        judge: bool = False,
+        residual_sums: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
         rasters: dict[int, Raster] = {}
@@ -78,7 +78,7 @@ class GsplatRasterizer(Rasterizer):
         kinds = [(_size(shot.view), shot.frozen is None) for shot in shots]
         for places in _alike(kinds):
             alike = [shots[k] for k in places]
-            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, blend_weights, judge)
+            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, blend_weights, residual_sums)
             rasters.update(zip(places, drawn, strict=True))
         return tuple(rasters[k] for k in range(len(shots)))
 
@@ -119,7 +119,7 @@ class GsplatRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool,
         blend_weights: bool,
-        judge: bool,
+        residual_sums: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
         frozen = [
@@ -138,7 +138,7 @@ class GsplatRasterizer(Rasterizer):
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
-        if judge:
+        if residual_sums:
             info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
         sheet = drawing.rasterized()
         return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]

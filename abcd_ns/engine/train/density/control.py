@@ -63,7 +63,7 @@ class DensityConfig:
     """default: split by error, and prune. mcmc: relocate, and add up to a limit (3DGS-MCMC)."""
     max_gaussians: int = 0
     """Limit for the whole scene. 0 is none (mcmc: 1,000,000). Of more points, a random choice starts."""
-    price: float = 8.0
+    min_contribution: float = 8.0
     """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
     Applies once growth ends. Strategy mcmc has the final pruning only.
     0 turns all pruning by contribution off, of floaters too, and the final pruning."""
@@ -134,7 +134,7 @@ class DensityControl:
     @property
     def wants_weights(self) -> bool:
         """Whether the rasterizer must leave `weights`."""
-        return self.config.strategy == "default" and self.config.price > 0
+        return self.config.strategy == "default" and self.config.min_contribution > 0
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
         """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
@@ -233,9 +233,10 @@ class DensityControl:
         """
         if not self.wants_weights or not have_contributions(growth):
             return growth
-        price, faint = (risen(each, progress, self.config.refine_stop) for each in (self.config.price, FAINT))
+        bounds = self.config.min_contribution, FAINT
+        least, faint = (risen(bound, progress, self.config.refine_stop) for bound in bounds)
         opacities = torch.sigmoid(params["opacities"][:, 0])
-        drop = (contributions(growth) <= price) | (opacities < MIN_ALPHA) | floaters(growth, opacities, faint)
+        drop = (contributions(growth) <= least) | (opacities < MIN_ALPHA) | floaters(growth, opacities, faint)
         growth = dict(growth)  # rows are taken out of it
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)

@@ -4,7 +4,7 @@
 few directions, often from a narrow cone of them, in which fewer harmonics tell nearly as much. What their
 lack changes in the pictures is the Gaussian's weight, known from pruning, times the mean square, over its
 views, by which its colour changes once the lower harmonics are fitted to the higher ones. Of all degrees that
-one is taken for which this and the price of the numbers are least together; those above do not come back.
+one is taken for which this and the cost of the numbers are least together; those above do not come back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ GONE = "gone"
 """Among a block's statistics: by how many degrees a Gaussian's harmonics end below the highest."""
 START = 0.5
 """Share of the run from which on degrees go: they have been trained by then."""
-NUMBER_PRICE = 1e-3
+NUMBER_COST = 1e-3
 """What a coefficient, of one channel, must change in the pictures: pixels times a colour's square, 0..1."""
 MOST_VIEWS = 64
 """As many of a block's views tell from where a Gaussian is seen."""
@@ -139,7 +139,7 @@ def _lowered(
         fitted = _fitted(gram, values, kept)
         change = fitted - values
         square = (change * (gram @ change)).sum(dim=(1, 2)) / 3
-        cost = weight * square.clamp_min(0.0) + NUMBER_PRICE * 3 * (kept - 1)
+        cost = weight * square.clamp_min(0.0) + NUMBER_COST * 3 * (kept - 1)
         pays = (cost < least) & (candidate <= before)
         best = torch.where(pays[:, None, None], fitted, best)
         degree, least = torch.where(pays, candidate, degree), torch.where(pays, cost, least)

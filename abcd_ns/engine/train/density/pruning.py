@@ -4,7 +4,7 @@ What a Gaussian weighs in a picture is the sum over pixels of alpha T, the trans
 before its block included: so many pixels it fills. Drawings that train it tell for nothing (see
 `with_blend_weights`). Added up over the views of its block it says what would be missing without it, as
 RadSplat (Niemeyer et al., 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the
-sum of such weights when training ends. Here they go while it goes on, at a price that rises as growth comes
+sum of such weights when training ends. Here they go while it goes on, at a minimum that rises as growth comes
 to its end: those that remain take their place, and each step costs less.
 """
 
@@ -22,7 +22,7 @@ BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
 trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
 scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though
-the price is in the photo's: so little grows before pictures are large enough to tell."""
+the minimum is in the photo's: so little grows before pictures are large enough to tell."""
 FULL_PASS = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
@@ -116,9 +116,9 @@ def floaters(
 
 
 def risen(bound: float, progress: float, growth_ends: float) -> float:
-    """What a bound, as the price, is at a share of the run: it rises until growth ends, for who is new has
-    not found its place. Late in the run it is 0, and only what fills nothing at all goes, for what is missed
-    could not be made good."""
+    """What a bound, as `min_contribution`, is at a share of the run. It rises until growth ends: what is new
+    has not found its place. Late in the run it is 0, so that only what fills nothing at all goes: what is
+    missed could not be made good."""
     if progress >= LAST:
         return 0.0
     return bound * min(progress / growth_ends, 1.0) if growth_ends > 0 else bound

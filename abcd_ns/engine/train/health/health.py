@@ -124,7 +124,7 @@ class Health:
             return
         scales[rows] = torch.where(over[rows], allowed[rows], scales[rows])
         self._forget_moments("scales", rows)
-        self.count("giants", len(rows))
+        self.count("oversized", len(rows))
 
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:

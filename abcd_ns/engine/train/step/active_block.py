@@ -148,12 +148,12 @@ class ActiveBlock:
         pixels = sum(run.views[view].full.pixels for view in run.active.trained_on)
         return contributions(self.growth) > FILLS * pixels
 
-    def judge(self) -> None:
+    def prune(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
         change too little. What is seen from now on soon counts for more."""
         run, before = self._run, len(self)
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share)
-        run.health.count("shed", before - len(self))
+        run.health.count("pruned", before - len(self))
         self._lower_degrees()
         self.growth = faded(self.growth)
 

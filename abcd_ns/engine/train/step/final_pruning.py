@@ -93,7 +93,7 @@ class FinalPruning:
     def is_wanted(self) -> bool:
         """Whether the run's options let Gaussians go."""
         density = self._run.density.config
-        return density.price > 0 and density.strategy != "off"
+        return density.min_contribution > 0 and density.strategy != "off"
 
     def run(self) -> None:
         """Do it; tells listeners how many went, and at what cost."""
@@ -106,7 +106,7 @@ class FinalPruning:
         costs = ranked.double().cumsum(0)
         views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
         before = after = self._psnr(scene, views, worth, -1.0, 0)
-        few, many, price, guess = 0, len(ranked) + 1, -1.0, LOSS
+        few, many, least, guess = 0, len(ranked) + 1, -1.0, LOSS
         for taken in range(ROUNDS):
             suggested = min(int(torch.searchsorted(costs, guess)), len(ranked))
             number = suggested if many > len(ranked) else (few + many) // 2
@@ -115,11 +115,11 @@ class FinalPruning:
             tried = float(ranked[number - 1])
             found = self._psnr(scene, views, worth, tried, taken + 1)
             if before - found <= LOSS:
-                few, price, after, guess = number, tried, found, 2 * guess
+                few, least, after, guess = number, tried, found, 2 * guess
             else:
                 many = number
         del scene
-        gone = sum(self._prune_block(block, of_block, price) for block, of_block in enumerate(worth))
+        gone = sum(self._prune_block(block, of_block, least) for block, of_block in enumerate(worth))
         run.announce(PrunedAtEnd(gone, run.count(), len(views), before, after))
 
     def _room(self, views: Sequence[View]) -> int:
@@ -157,15 +157,15 @@ class FinalPruning:
 
     @torch.no_grad()
     def _psnr(
-        self, scene: BlockScene, views: list[View], worth: Sequence[Tensor], price: float, rounds: int
+        self, scene: BlockScene, views: list[View], worth: Sequence[Tensor], least: float, rounds: int
     ) -> float:
-        """Mean over views without who is worth no more than a price, dB.
+        """Mean over views without what is worth no more than `least`, dB.
 
         Args:
             rounds: that are done; listeners are told.
         """
         device = self._run.device
-        left = ChangedScene(scene, lambda block, found: found[(worth[block] > price).to(device)])
+        left = ChangedScene(scene, lambda block, found: found[(worth[block] > least).to(device)])
         pictures = self._whole.pictures(views, left)
         found = []
         self._run.announce(PhotosWanted(tuple(view.index for view in views)))
@@ -181,14 +181,14 @@ class FinalPruning:
         seen, photo, counts = self._whole.beside(view, picture.color.detach())
         return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts
 
-    def _prune_block(self, block: int, worth: Float[Tensor, "n"], price: float) -> int:
-        """Put a block to rest with its migrants, without those worth at most `price`; return how many."""
+    def _prune_block(self, block: int, worth: Float[Tensor, "n"], least: float) -> int:
+        """Put a block to rest with its migrants, without those worth at most `least`; return how many."""
         run, scene = self._run, self._run.scene
-        gone = int((worth <= price).sum())
+        gone = int((worth <= least).sum())
         if gone:
             state = with_pending(scene, block)
             stays = state.deferred.clone()  # who is not drawn
-            stays[~state.deferred] = worth > price
+            stays[~state.deferred] = worth > least
             run.rest(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone
 
