@@ -2,7 +2,9 @@
 
 import dataclasses
 import itertools
+import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ from rich.console import Console
 
 from abcd_ns.cli.check.command import check
 from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
-from abcd_ns.cli.plan.forecast import Forecast
+from abcd_ns.cli.plan.forecast import LOST, Forecast
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
@@ -19,6 +21,8 @@ from abcd_ns.units import GIB
 from tests.cli.check.scenes import wide
 from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
 from tests.reference.scenes import random_gaussians, ring_of_views
+
+BUDGETS = Path(__file__).parents[2] / "docs" / "results" / "budgets"
 
 
 def capture(count: int = 400) -> Capture:
@@ -63,6 +67,21 @@ def test_a_device_budget_decides_how_many_blocks():
     assert few.fit.blocks_at_the_end == few.fit.blocks == many.fit.blocks == 1
     assert many.fit.blocks_at_the_end > 2
     assert sum(many.shares["device"].values()) <= 3 * GIB
+    assert few.quality is None
+    assert many.quality.startswith("up to ")
+
+
+def test_what_less_memory_costs_is_what_was_measured():
+    """The most that a stored run of `abcd` lies below one block without a limit, rounded up."""
+    worst = dict.fromkeys(LOST, 0.0)
+    for file in sorted(BUDGETS.glob("*.json")):
+        arms = json.loads(file.read_text())["arms"]
+        runs = {(arm["method"], arm["value"]): arm["runs"][0] for arm in arms}
+        joint = runs["abcd-monolithic", None]
+        for share in LOST if "640" not in file.name else ():
+            limited = runs["abcd", int(joint["gaussian_bytes"] * share)]
+            worst[share] = max(worst[share], joint["psnr_merged"] - limited["psnr_merged"])
+    assert {share: math.ceil(10 * lost) / 10 for share, lost in worst.items()} == LOST
 
 
 @pytest.mark.parametrize("height", [1000, 100])

@@ -153,6 +153,8 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         "Gaussians": f"{sum(found.points_of_block):,} points to begin with, {fit.gaussians:,} expected",
         "time": f"{in_words(low)} to {in_words(high)}: {found.wanted.steps:,} steps of {views}",
     }
+    if found.quality:
+        rows["quality"] = found.quality
     if found.wanted.workers > 1:
         rows["workers"] = (
             f"{found.wanted.workers}, each with as much of a GPU, or of the RAM, as the device below"

@@ -31,6 +31,9 @@ PLACES = {
 """Where memory is needed, and the words for a lack of it, with the fix."""
 DAY = 24
 """Hours from which on a forecast names ways to take less."""
+LOST = {1 / 4: 1.2, 1 / 8: 2.4, 1 / 16: 3.5}
+"""dB below one block, by the share of its memory for Gaussians that a block has. The most of four scenes, 160
+px wide (docs/results/README.md)."""
 LAYERS_BY_STEPS = 0.15
 """Time for layers by the time of steps: they take 10 to 18% of runs on a CPU (docs/results)."""
 
@@ -75,6 +78,20 @@ class Forecast:
         layers = 1 + LAYERS_BY_STEPS * (self.fit.blocks_at_the_end > 1)
         low = self.wanted.steps * self.seconds_per_step * layers / 3600
         return low, low * max(self.fit.gaussians / max(sum(self.points_of_block), 1), 1.0)
+
+    @property
+    def quality(self) -> str | None:
+        """What it costs that memory limits the scene, or cuts it into blocks; None where it does neither."""
+        fit, share = self.fit, self.fit.sole / max(self.fit.gaussians, 1)
+        if not 0 < share < 1:
+            return None
+        if not fit.limit:
+            return f"limited to {fit.sole:,} Gaussians: there is no room for the layers of several blocks"
+        lost = next(
+            (f"up to {lost} dB" for least, lost in LOST.items() if share >= least),
+            f"over {max(LOST.values())} dB",
+        )
+        return f"{lost} below one block with {1 / share:.1f} times this memory"
 
     @property
     def warnings(self) -> list[str]:
