@@ -20,7 +20,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 HELD_OUT_EVERY = 8
 """One view in so many is never trained on: 0, 8, 16, ... of the list sorted by name, as in the papers of the
 field, or a sector."""
-HoldOut = Literal["interval", "sector"]
+HoldOut = Literal["auto", "interval", "sector"]
 AS_IT_IS = "default"
 """Name of the variant without changes."""
 
@@ -47,7 +47,7 @@ class Settings:
     """Points of the curve of held-out PSNR over training time, the end included."""
     pictures: int
     """Held-out views that are shown."""
-    hold_out: HoldOut = "interval"
+    hold_out: HoldOut = "auto"
     """See `AbcdDataParserConfig.eval_mode`."""
 
     @property

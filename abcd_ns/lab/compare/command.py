@@ -73,7 +73,8 @@ class Options:
     """An arm for each share, such as 1/4, of the memory that abcd-monolithic takes for Gaussians.
     Each method of ABCD's keeps to it. abcd-monolithic and splatfacto also run without a limit."""
     hold_out: HoldOut | None = None
-    """Which views are not trained on: every 8th by name, or an eighth from one place. Default: interval."""
+    """Which views are not trained on. auto, the default: those that the data list, without lists every 8th by
+    name. interval: every 8th. sector: an eighth from one place."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
     pictures: Annotated[int | None, words("N")] = None
@@ -98,7 +99,7 @@ DEFAULTS = Options(
     downscale=1,
     blocks=(8,),
     vary=(),
-    hold_out="interval",
+    hold_out="auto",
     evals=8,
     pictures=3,
 )

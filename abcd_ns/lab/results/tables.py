@@ -205,7 +205,9 @@ def _protocol(results: Results) -> str:
     if s.blocks and set(results.methods) != {"abcd-monolithic"}:
         conditions.append(f"{s.blocks} blocks")
     held_out = f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on"
-    if s.hold_out == "sector":
+    if s.hold_out == "auto":
+        held_out = f"as the data list, without lists {held_out}"
+    elif s.hold_out == "sector":
         held_out = f"one view in {HELD_OUT_EVERY}, all from one place"
     return f"Scene {s.scene} at 1/{s.downscale} of its size; held out: {held_out}; {', '.join(conditions)}."
 
