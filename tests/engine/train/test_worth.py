@@ -95,16 +95,6 @@ def test_what_fits_is_worth_nothing_and_a_larger_bound_refuses_more():
     assert float(worth(found, len(VIEWS), 1.1 * gain / pixel)[0]) == 0.0
 
 
-def test_the_native_library_and_torch_ask_for_the_same():
-    gaussians, truth = random_gaussians(30, sh_degree=0), random_gaussians(30, seed=1, sh_degree=0)
-    photos = {view.index: DRAW(truth, view, sh_degree=0).color for view in VIEWS}
-    fast, slow = (
-        judged(gaussians, lambda view: photos[view.index], draw)
-        for draw in (DRAW, TorchRasterizer(use_native=False))
-    )
-    torch.testing.assert_close(fast, slow, rtol=1e-3, atol=1e-3 * float(slow[:, :24].abs().max()))
-
-
 def test_what_is_no_number_counts_for_nothing():
     sums = torch.ones(4, 10)
     sums[1, 4], sums[2, 0] = torch.nan, 0.0
