@@ -1,7 +1,6 @@
 """Whole trainings by the engine on the simulated device: whatever is on the wrong side raises."""
 
 import gc
-import math
 import weakref
 
 import pytest
@@ -115,17 +114,6 @@ def test_a_warm_up_is_trained_and_blocks_that_outgrow_their_limit_are_split(on_d
     assert coordinator.state.step == 14
     assert splits
     assert coordinator.scene.tree.num_blocks == 2 + len(splits)
-
-
-def test_what_is_no_number_is_repaired(on_device, photos):
-    coordinator = on_device(blocks=2, steps=8, density=GROWING)
-    train(coordinator, photos, steps=3)
-    with torch.no_grad():
-        coordinator.params["scales"][0] = math.nan
-        coordinator.params["scales"][1] = 5.0
-    train(coordinator, photos)
-    assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
-    assert sum(record.values for record in coordinator.state.health.values()) > 0
 
 
 def test_a_run_is_saved_and_gone_on_with(make, on_device, photos):

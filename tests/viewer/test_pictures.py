@@ -38,15 +38,6 @@ def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, win
     return BlockPictures(renderer, VIEW, SETTINGS, window_weight)
 
 
-def test_the_device_holds_one_node_at_a_time(monkeypatch):
-    counts, draw = [], TorchRasterizer.draw
-    watched = lambda self, g, *a, **k: counts.append(len(g)) or draw(self, g, *a, **k)  # noqa: E731
-    monkeypatch.setattr(TorchRasterizer, "draw", watched)
-    pictures("means").draw(Show.EVERYTHING, None)
-    assert len(counts) == 6
-    assert max(counts) < len(GAUSSIANS) / 4
-
-
 def test_a_block_alone_is_its_own_gaussians():
     owner = TREE.assign(GAUSSIANS.means)
     found = pictures().draw(Show.BLOCK, 2)

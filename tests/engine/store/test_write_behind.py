@@ -10,11 +10,9 @@ import torch
 
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.packed import DRAWN
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.scene import StoredScene
@@ -218,23 +216,6 @@ def test_a_picture_that_is_broken_off_leaves_no_lock_behind(scene):
 
 
 # RAM
-
-
-def test_what_only_its_own_visit_needs_goes_first(scene):
-    states = [scene.state(number).packed() for number in range(4)]
-    rests = [state.part(set(DRAWN)) for state in states]
-    memory = BlockMemory(3 * rests[0].nbytes)
-    for number in range(3):
-        memory.put(number, states[number])
-        memory.shrink()
-    assert [memory.whole(number) for number in range(3)] == [None] * 3
-    for number in range(3):
-        assert memory.drawn(number).tensors["means"] is states[number].tensors["means"]
-    memory.drawn(0)
-    memory.put(3, rests[3])
-    memory.shrink()
-    assert [memory.drawn(number) is None for number in range(4)] == [False, True, False, False]
-    assert memory.nbytes == sum(rests[number].nbytes for number in (0, 2, 3))
 
 
 # The pending migrants
