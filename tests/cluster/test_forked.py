@@ -93,10 +93,10 @@ def test_whoever_is_killed_is_replaced_and_nothing_is_lost(make, photos, steady)
     assert not any(is_alive(pid) for pid in alive)
 
 
-FULL = [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+FULL = RuntimeError("DefaultCPUAllocator: can't allocate memory")
 
 
-@pytest.mark.parametrize("trouble", [*map(raising, FULL), lambda: time.sleep(600)])
+@pytest.mark.parametrize("trouble", [raising(FULL), lambda: time.sleep(600)])
 def test_a_visit_without_memory_or_a_word_is_assigned_again(
     make, photos, steady, tmp_path, monkeypatch, trouble
 ):
@@ -188,8 +188,7 @@ def test_one_that_draws_layers_for_long_is_not(tmp_path, views, photos, monkeypa
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (KeyError("no photo 3"), r"KeyError: 'no photo 3' \(test_forked\.py:\d+, in act\)\..*workers 1"),
-        (ValueError("two\nlines"), r"ValueError: two \(test_forked"),
+        (ValueError("two\nlines"), r"ValueError: two \(test_forked\.py:\d+, in act\)\..*workers 1"),
         (UserError("The photo is gone: put it back."), r"^The photo is gone: put it back\.$"),
     ],
 )

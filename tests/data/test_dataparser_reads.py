@@ -177,15 +177,6 @@ def test_photos_without_pose_are_mentioned(scene, capsys):
     assert "1 photos in" in capsys.readouterr().out
 
 
-def test_a_scene_is_read_once_for_all_splits(scene):
-    checked = parser(scene)
-    checked.get_dataparser_outputs("test")
-    shutil.rmtree(scene / "sparse")
-    assert len(checked.get_dataparser_outputs().image_filenames) == 8
-    with pytest.raises(InputError, match="holds no model"):
-        parser(scene).get_dataparser_outputs()
-
-
 # transforms.json
 
 

@@ -75,11 +75,6 @@ def test_photos_and_cameras_are_those_that_splatfacto_trains_on(tmp_path, kind, 
     assert ours.cameras.distortion_params is None
 
 
-def test_our_own_reader_is_left_alone(scene):
-    outputs = parser(scene).get_dataparser_outputs()
-    assert with_photos(outputs) is outputs
-
-
 def test_transparent_photos_lie_on_the_readers_colour(tmp_path):
     data = write_blender(tmp_path)
     ours, theirs = (

@@ -2,18 +2,16 @@
 
 import re
 import sys
-import warnings
 from contextlib import redirect_stdout
 from importlib.metadata import packages_distributions
 from io import StringIO
-from multiprocessing import Pipe, get_context
-from multiprocessing.connection import Connection
 
 import nerfstudio.configs.method_configs  # noqa: F401 - what is stock is there
 import pytest
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 
+from tests.nerfstudio.forks import forget, in_a_fork
 from tests.test_house_rules import PACKAGE_FILES, PYPROJECT
 
 NEEDED = ("viser", "cv2", "fcntl")
@@ -22,8 +20,7 @@ NOT_NEEDED = ("trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray"
 
 def discovered(*missing: str) -> tuple[object, str, bool]:
     """Our method, its words and whether our reader is there, as nerfstudio finds them without modules."""
-    for module in [name for name in sys.modules if name.split(".")[0] == "abcd_ns"]:
-        del sys.modules[module]
+    forget("abcd_ns")
     before = {name: found for name, found in sys.modules.items() if name.split(".")[0] in missing}
     sys.modules.update(dict.fromkeys([*missing, *before]))  # None: importing it fails
     methods, words = discover_methods()
@@ -34,10 +31,8 @@ def discovered(*missing: str) -> tuple[object, str, bool]:
     return methods["abcd"], words["abcd"], "abcd-data" in parsers
 
 
-def discover_all(answer: Connection) -> None:
-    """In a fork, whose modules are its own."""
-    warnings.simplefilter("ignore")
-    sys.meta_path[:] = [finder for finder in sys.meta_path if "jaxtyping" not in type(finder).__module__]
+def discover_all() -> tuple[dict, str]:
+    """What nerfstudio finds while something is missing, by what that is; and what is said on the terminal."""
     found = {name: discovered(name) for name in NEEDED}
     found["others"] = discovered(*NOT_NEEDED)
     code, said = None, StringIO()
@@ -47,20 +42,12 @@ def discover_all(answer: Connection) -> None:
     except SystemExit as end:
         code = end.code
     kinds = {name: (type(config).__name__, *rest) for name, (config, *rest) in found.items()}
-    answer.send(({**kinds, "code": code}, said.getvalue()))
+    return {**kinds, "code": code}, said.getvalue()
 
 
 @pytest.fixture(scope="module")
 def without() -> tuple[dict, str]:
-    """What nerfstudio finds while something is missing, by what that is; and what is said on the terminal."""
-    here, there = Pipe()
-    process = get_context("fork").Process(target=discover_all, args=(there,))
-    process.start()
-    there.close()
-    try:
-        return here.recv()
-    finally:
-        process.join()
+    return in_a_fork(discover_all)
 
 
 def test_what_training_needs_is_named_when_it_is_missing(without):

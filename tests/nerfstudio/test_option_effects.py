@@ -26,6 +26,7 @@ def learnt(data, tmp_path_factory):
 
     def train(name: str | None = None, value: object = None) -> str:
         config = configure(data, tmp_path_factory.mktemp("out"), steps=6, blocks=2)
+        config.pipeline.model.num_random = 300
         if name is not None:
             parent, _, last = f"config.{name}".rpartition(".")
             setattr(attrgetter(parent)(SimpleNamespace(config=config)), last, value)

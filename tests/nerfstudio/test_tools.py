@@ -103,19 +103,15 @@ def rendered(trained, tmp_path, monkeypatch):
     return draw
 
 
-def test_a_camera_path_is_rendered_with_depth_and_accumulation(rendered):
-    frames = rendered(["rgb", "depth", "accumulation"])
-    assert list(frames) == [f"{k:05d}.png" for k in range(3)]
-    assert {frame.shape for frame in frames.values()} == {(HEIGHT, 3 * WIDTH, 3)}
-
-
-def test_normals_and_median_depth_are_rendered_when_asked_for(rendered, monkeypatch):
+def test_a_camera_path_is_rendered_with_normals_and_median_depth_when_asked_for(rendered, monkeypatch):
     asked = []
     for name in ("draw_normals", "draw_median"):
         draws = getattr(AbcdModel, name)
         watched = lambda self, view, name=name, draws=draws: (asked.append(name), draws(self, view))[1]  # noqa: E731
         monkeypatch.setattr(AbcdModel, name, watched)
-    rendered(["rgb", "depth"])
+    frames = rendered(["rgb", "depth", "accumulation"])
+    assert list(frames) == [f"{k:05d}.png" for k in range(3)]
+    assert {frame.shape for frame in frames.values()} == {(HEIGHT, 3 * WIDTH, 3)}
     assert asked == []
     frames = rendered(["normals", "depth_median"])
     assert asked == 3 * ["draw_normals", "draw_median"]

@@ -4,8 +4,6 @@ import torch
 
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import STILL, equal, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 SIZE = 2 * 6 * 8 * 4 * 2
@@ -40,22 +38,3 @@ def test_what_is_inside_the_window_goes_along(counts):
     store.put(0, Kept(kept().layers, interleaved))
     assert counts.copies_to_host == 2
     assert torch.equal(store.get(0).interleaved.planes.cpu(), interleaved.planes.cpu())
-
-
-def test_a_run_does_not_depend_on_where_its_layers_are(on_device, photos):
-    scenes = []
-    for name, on, ram in (
-        ("device", 1 << 30, 0),
-        ("RAM", 0, 1 << 30),
-        ("each", 60_000, 60_000),
-        ("none", 0, 0),
-    ):
-        options = {"layer_bytes": on, "layer_ram_bytes": ram, "density": STILL}
-        coordinator = on_device(name, blocks=3, steps=6, **options)
-        held = []
-        coordinator.announce.subscribe(lambda _, c=coordinator, h=held: h.append(c.layer_bytes))
-        train(coordinator, photos)
-        assert (max(held) > 0) == (name != "none")
-        assert max(held) <= coordinator.layer_limit == on + ram
-        scenes.append(whole_scene(coordinator))
-    assert all(equal(scenes[0], other) for other in scenes[1:])

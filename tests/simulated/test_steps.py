@@ -51,7 +51,7 @@ def steps_alone(coordinator, photos, counts: Counts) -> list[Counts]:
     return found
 
 
-@pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (4, 0), (4, 300)])
+@pytest.mark.parametrize(("blocks", "parts"), [(4, 0), (4, 300)])
 def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, blocks, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
     coordinator = on_device(blocks=blocks, steps=3 * blocks, density=GATHERING, crop_pixels=parts)
@@ -105,11 +105,10 @@ def test_no_more_ram_is_pinned_for_a_block_than_there_is_for_that(counts, monkey
     assert waits == [4, 2, 1]
 
 
-@pytest.mark.usefixtures("counts")
-def test_listeners_hear_of_a_step_when_the_next_is_taken(make, photos):
+def test_listeners_hear_of_a_step_when_the_next_is_taken(make, on_device, photos):
     heard = []
-    for device in (torch.device("cpu"), DEVICE):
-        coordinator = make(device.type, blocks=2, steps=6, density=STILL, device=device, ownership="means")
+    for name, made in (("cpu", make), ("device", on_device)):
+        coordinator = made(name, blocks=2, steps=6, density=STILL, ownership="means")
         heard.append(listen(coordinator, StepTaken))
         train(coordinator, photos)
         assert coordinator.state.health
@@ -138,9 +137,8 @@ def values(coordinator) -> dict[str, torch.Tensor]:
     return {name: coordinator.params[name].detach().clone() for name in PARAM_NAMES}
 
 
-@pytest.mark.usefixtures("counts")
-def test_a_step_whose_gradients_are_no_numbers_is_skipped(make, photos):
-    coordinator = make(blocks=1, steps=12, density=GATHERING, device=DEVICE)
+def test_a_step_whose_gradients_are_no_numbers_is_skipped(on_device, photos):
+    coordinator = on_device(blocks=1, steps=12, density=GATHERING)
     told = listen(coordinator, Repaired)
     spoil_once(coordinator, 3)
     spoil_once(coordinator, 6)

@@ -123,16 +123,6 @@ def test_malformed_frames_change_nothing(server, browser, answers, capfd):
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
-def test_no_attribute_of_a_control_can_be_overwritten(server, browser, answers):
-    slider = server.gui.add_slider("n", min=0, max=9, step=1, initial_value=4)
-    for name in ("update_cb", "typ", "sync_cb"):
-        browser.send({"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": {name: "x"}})
-    assert answers()
-    assert slider._impl.update_cb == []
-    assert slider.value == 4
-    slider.remove()
-
-
 def test_no_client_writes_a_file_outside_the_folder_of_camera_paths(server, browser, answers, tmp_path):
     """nerfstudio's render panel writes DATA/camera_paths/NAME.json, with NAME as the client sends it."""
     victim = tmp_path / "manifest.json"

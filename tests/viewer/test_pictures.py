@@ -38,23 +38,6 @@ def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, win
     return BlockPictures(renderer, VIEW, SETTINGS, window_weight)
 
 
-@pytest.mark.parametrize("pass_gaussians", [0, 150, 10**6])
-def test_the_scene_by_nodes_is_the_scene_at_once(pass_gaussians):
-    merged = DRAW(GAUSSIANS, VIEW, sh_degree=1)
-    found = pictures(pass_gaussians=pass_gaussians).draw(Show.EVERYTHING, None)
-    for name in ("color", "transmittance", "depth"):
-        assert float((getattr(found, name) - getattr(merged, name)).abs().max()) < 2e-3, name
-
-
-def test_the_device_holds_one_node_at_a_time(monkeypatch):
-    counts, draw = [], TorchRasterizer.draw
-    watched = lambda self, g, *a, **k: counts.append(len(g)) or draw(self, g, *a, **k)  # noqa: E731
-    monkeypatch.setattr(TorchRasterizer, "draw", watched)
-    pictures("means").draw(Show.EVERYTHING, None)
-    assert len(counts) == 6
-    assert max(counts) < len(GAUSSIANS) / 4
-
-
 def test_a_block_alone_is_its_own_gaussians():
     owner = TREE.assign(GAUSSIANS.means)
     found = pictures().draw(Show.BLOCK, 2)

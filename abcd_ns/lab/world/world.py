@@ -150,12 +150,6 @@ class Surfaces(World):
         return (base + 0.12 * waves).clamp(0.02, 0.98)
 
 
-def rays_through(view: View, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """World directions through pixel positions, scaled to unit camera z; in the view's dtype."""
-    at = (xy - view.K[:2, 2]) / view.K.diagonal()[:2]
-    return torch.cat([at, torch.ones_like(at[:, :1])], dim=1) @ view.viewmat[:3, :3]
-
-
 def project(view: View, places: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
     """Pixel positions of places, and their camera z."""
     at = places @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]

@@ -66,12 +66,6 @@ def test_tensors_of_unequal_length_are_refused():
         BlockState(random_gaussians(3), random_gaussians(2), random_gaussians(3))
 
 
-def test_attach_then_detach_is_the_identity():
-    state = some_state(6)
-    params, optimizers = live(state)
-    assert_same(detach(params, optimizers, state.growth, state.clocks), state)
-
-
 def test_a_block_that_rested_trains_as_if_it_had_not():
     state = some_state(6)
     stayed = live(state)

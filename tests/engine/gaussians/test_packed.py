@@ -69,12 +69,6 @@ def test_what_is_kept_is_as_much_as_the_degrees_ask_for():
     assert count_parameters(state.gaussians.features_rest) == packed.meta["parameters"]
 
 
-def test_what_is_drawn_needs_no_more_than_its_columns():
-    state = of_degrees([3, 0, 2])
-    drawn = state.packed().part(set(DRAWN)).gaussians()
-    assert all(torch.equal(value, getattr(state.gaussians, name)) for name, value in drawn.items())
-
-
 def test_some_rows_of_what_is_drawn_are_those_of_all():
     state = of_degrees([3, 0, 2, 1, 0, 3])
     rows = torch.tensor([True, False, True, False, True, False])

@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import (
-    UNDER_TRAINED_RATES,
     Pace,
     adam_step,
     attach,
     detach,
     nothing_live,
-    rates_of_under_trained,
 )
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
@@ -42,13 +40,6 @@ def travelled(views: int, steps: int) -> dict[str, float]:
 def test_views_that_agree_come_as_far_together_as_one_by_one(views):
     together, one_by_one = travelled(views, steps=1), travelled(1, steps=views)
     assert together == pytest.approx(one_by_one, rel=1e-2)
-
-
-@given(views=st.integers(0, 10**6), more=st.integers(0, 10**6), batch=st.integers(1, 8))
-def test_rates_fall_from_four_times_to_what_was_given(views, more, batch):
-    assert rates_of_under_trained(0, batch) == max(UNDER_TRAINED_RATES / batch, 1.0)
-    assert 1.0 <= rates_of_under_trained(views + more, batch) <= rates_of_under_trained(views, batch)
-    assert rates_of_under_trained(10**6, batch) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -46,13 +46,6 @@ def test_no_point_is_far_from_the_one_that_stands_for_it(seed, pixels, width):
     assert float(tints.max()) <= float(colors.max()) + 1e-3
 
 
-def test_a_clump_is_one_point_in_its_midst_of_its_mean_colour():
-    points, colors = cloud(50, 3, width=1e-5)
-    found, tints = thin_points(points + 0.013, colors, VIEWS, 2.0)
-    torch.testing.assert_close(found, (points + 0.013).mean(dim=0, keepdim=True), rtol=0, atol=1e-5)
-    torch.testing.assert_close(tints, colors.mean(dim=0, keepdim=True), rtol=1e-4, atol=1e-2)
-
-
 def test_points_that_nobody_sees_stay_and_so_do_all_at_0():
     points, colors = cloud(40, 4, width=1e-4)
     unseen = points + torch.tensor([0.0, 0.0, 500.0])
@@ -80,9 +73,3 @@ def test_points_of_a_cube_become_their_mean_cubes_in_order(monkeypatch, chunk):
     assert 60 < len(found) == len(cubes) < 190
     expected = torch.stack([torch.stack(cubes[cube]).mean(dim=0) for cube in sorted(cubes)])
     torch.testing.assert_close(found, expected.float(), rtol=1e-6, atol=1e-6)
-
-
-def test_fine_photos_keep_what_coarse_ones_do_not():
-    points, colors = cloud(400, 5, width=0.6)
-    coarse, fine = (ring_of_views(6, width=48 * k, height=36 * k) for k in (1, 8))
-    assert len(thin_points(points, colors, coarse, 2.0)[0]) < len(thin_points(points, colors, fine, 2.0)[0])

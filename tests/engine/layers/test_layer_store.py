@@ -4,11 +4,9 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers import visit_layers as visit
-from abcd_ns.engine.layers.layer_renderer import FrozenLayers
-from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.types import Layer
 from tests.reference.scenes import equal, whole_scene
 
 CPU = torch.device("cpu")
@@ -16,14 +14,6 @@ CPU = torch.device("cpu")
 
 def kept(height: int = 5, width: int = 7, interleaved: Splats | None = None) -> Kept:
     return Kept(rounded(torch.rand(2, height, width, 4)), interleaved)
-
-
-def test_packing_is_undone_by_unpacking():
-    parts = FrozenLayers(*(Layer(torch.rand(5, 7, 3), torch.rand(5, 7)) for _ in range(2)))
-    again = unpacked(packed(parts))
-    for side in ("front", "back"):
-        assert torch.equal(getattr(again, side).color, getattr(parts, side).color)
-        assert torch.equal(getattr(again, side).transmittance, getattr(parts, side).transmittance)
 
 
 def test_rounding_keeps_eleven_bits_and_nothing_and_everything():

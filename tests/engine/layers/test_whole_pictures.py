@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
@@ -56,10 +56,3 @@ def test_pictures_and_gradients_of_poses_are_those_of_the_merged_picture(pass_ga
         expected = torch.tensor([(loss(view, step) - loss(view, -step)) / 2e-6 for step in steps])
         assert torch.allclose(by_step(matrix, view.viewmat).float(), expected, rtol=2e-3, atol=2e-2)
         assert float(expected.abs().min()) > 0.1
-
-
-def test_views_are_drawn_together_as_far_as_their_layers_have_room():
-    assert [len(group) for group in whole_pictures_of(0).groups(VIEWS)] == [3]
-    one = 4 * BYTES_PER_PIXEL * VIEWS[0].full.pixels
-    assert [len(group) for group in whole_pictures_of(0, 2 * one).groups(VIEWS)] == [2, 1]
-    assert [len(group) for group in whole_pictures_of(0, 1).groups(VIEWS)] == [1, 1, 1]

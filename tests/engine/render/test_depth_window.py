@@ -42,7 +42,7 @@ def means_of_tiles(image: torch.Tensor) -> torch.Tensor:
     return image.reshape(*image.shape[:-2], rows, SIDE, cols, SIDE).mean(dim=(-3, -1))
 
 
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(seed=SEEDS)
 def test_what_the_window_leaves_out_on_either_side_weighs_less_than_said(seed):
     gaussians, view = scene(seed)
@@ -90,8 +90,7 @@ def test_tiles_that_stick_out_of_the_crop_count_their_own_pixels():
     assert torch.equal(shows[clear], total[clear] >= visible)
 
 
-@pytest.mark.parametrize("use_native", [False, True])
-@pytest.mark.parametrize("at_once", [(600, 10**6), (10**6, 130)])
+@pytest.mark.parametrize(("use_native", "at_once"), [(True, (600, 10**6)), (False, (10**6, 130))])
 def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypatch, use_native, at_once):
     monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.PIXELS_AT_ONCE", at_once[0])
     monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.SPLATS_AT_ONCE", at_once[1])

@@ -81,7 +81,7 @@ def test_gsplats_kernels_draw_the_same_on_a_device():
     found = []
     with simulated_device(), lent():
         for device in ("cpu", DEVICE):
-            leaves = random_gaussians(40, dtype=torch.float32).to(device)
+            leaves = random_gaussians(20, dtype=torch.float32).to(device)
             leaves = Gaussians(**{name: value.requires_grad_() for name, value in leaves.items()})
             pictures, alphas, meta = drawn(leaves, [view.to(torch.float32) for view in VIEWS])
             meta["means2d"].retain_grad()

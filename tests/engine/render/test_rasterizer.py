@@ -83,12 +83,6 @@ def test_scene_has_what_the_tests_are_about():
     torch.testing.assert_close(stacked(expected), stacked(dense), rtol=1e-11, atol=1e-12)
 
 
-def test_tile_size_does_not_matter():
-    draws = (EAGER, TorchRasterizer(use_native=False, tile_side=16))
-    found = (partial(draw, view=VIEW, sh_degree=2) for draw in draws)
-    assert_drawn_alike(*found, random_gaussians(40), 1e-13, 1e-11)
-
-
 @pytest.mark.parametrize("draw", [EAGER, TorchRasterizer()], ids=["torch", "native"])
 @given(data=st.data())
 @settings(max_examples=12)

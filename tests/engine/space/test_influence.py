@@ -102,16 +102,6 @@ def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer
     assert InfluenceTable(tree, range(4), known, "cpu").found() == (known, unknown)
 
 
-def test_moved_rows_are_looked_up_anew(rasterizer):
-    gaussians, (view,) = random_gaussians(80, seed=4, size=0.15), ring_of_views(1)
-    tree = build_kd(gaussians.means, 2)
-    (found,) = weights(gaussians, rasterizer, [Shot(view, view.full)])
-    table, few = InfluenceTable(tree, [0], {}, "cpu"), torch.where(tree.assign(gaussians.means) == 1)[0]
-    table.note(gaussians.means, [view], found[None])
-    table.note(gaussians.means[few], [view], found[None, few])
-    assert list(table.found()[0]) == [1]
-
-
 @given(
     st.dictionaries(st.integers(0, 99), st.floats(1e-6, 1), max_size=30), st.floats(0, 1, exclude_max=True)
 )

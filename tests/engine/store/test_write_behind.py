@@ -3,7 +3,6 @@
 import os
 import sys
 import threading
-import weakref
 from dataclasses import replace
 
 import pytest
@@ -11,11 +10,9 @@ import torch
 
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.packed import DRAWN
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store import ParameterStore, StoreError, parameter_store
-from abcd_ns.engine.store.block_memory import BlockMemory
+from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.scene import StoredScene
@@ -221,60 +218,6 @@ def test_a_picture_that_is_broken_off_leaves_no_lock_behind(scene):
 # RAM
 
 
-def test_what_only_its_own_visit_needs_goes_first(scene):
-    states = [scene.state(number).packed() for number in range(4)]
-    rests = [state.part(set(DRAWN)) for state in states]
-    memory = BlockMemory(3 * rests[0].nbytes)
-    for number in range(3):
-        memory.put(number, states[number])
-        memory.shrink()
-    assert [memory.whole(number) for number in range(3)] == [None] * 3
-    for number in range(3):
-        assert memory.drawn(number).tensors["means"] is states[number].tensors["means"]
-    memory.drawn(0)
-    memory.put(3, rests[3])
-    memory.shrink()
-    assert [memory.drawn(number) is None for number in range(4)] == [False, True, False, False]
-    assert memory.nbytes == sum(rests[number].nbytes for number in (0, 2, 3))
-
-
-def test_what_was_written_does_not_stay_while_the_next_waits(scene, disk):
-    disk.free.clear()
-    scene._memory.limit = 1
-    block = BlockState.fresh(scene.state(0).gaussians[1:]).packed()
-    means = weakref.ref(block.tensors["means"])
-    scene.rest(scene.tree, {0: block}, {"step": 1}, within=SOON)
-    del block
-    assert disk.asked.wait(PATIENCE)
-    rest(scene, 2, 1)
-    disk.free.set()
-    # Another block has the only place in RAM.
-    wait_until(lambda: scene.state(2) is not None and means() is None)
-    assert disk.commits == [({0}, {"step": 1})]
-
-
-@pytest.fixture
-def reads(monkeypatch) -> list[str]:
-    """The shards that are read."""
-    found, read = [], parameter_store.read_shard
-
-    def note(path, names):
-        found.append(path.name)
-        return read(path, names)
-
-    monkeypatch.setattr(parameter_store, "read_shard", note)
-    return found
-
-
-def test_a_block_is_read_ahead(scene, reads):
-    scene.read_ahead(2)
-    wait_until(lambda: reads)
-    assert len(scene.state(2)) == 10
-    scene.read_ahead(2)
-    scene.flush()
-    assert len(reads) == 1
-
-
 # The pending migrants
 
 
@@ -287,7 +230,7 @@ def shaken(coordinator, photos) -> None:
 
 
 def test_a_visit_writes_its_block_and_the_pending_migrants_alone(make, photos):
-    coordinator = make(blocks=4, steps=60, density=STILL, commit_seconds=0.0)
+    coordinator = make(blocks=4, steps=30, density=STILL, commit_seconds=0.0)
     disk, ended = Disk(coordinator.scene.store), listen(coordinator, VisitEnded)
     while not coordinator.finished:
         shaken(coordinator, photos)

@@ -57,8 +57,9 @@ def test_one_block_is_plain_3dgs_bit_for_bit(make, views, photos, start, growing
     assert equal(whole_scene(coordinator), expected)
 
 
-@pytest.mark.parametrize("ownership", ["fragments", "means"])
-@BOTH
+@pytest.mark.parametrize(
+    ("ownership", "primitive"), [("fragments", "3dgs"), ("fragments", "2dgs"), ("means", "3dgs")]
+)
 def test_the_blocks_gradient_is_that_of_the_whole_picture(make, ownership, primitive):
     """Through kept F and B == through a render of all blocks at once (invariant 3), in float64."""
     start, views = (
@@ -101,9 +102,8 @@ def gradient_of_whole_picture(coordinator, sample, weights, ownership) -> dict[s
     return {name: value.grad for name, value in active.items()}
 
 
-@pytest.mark.parametrize("blocks", [1, 8])
-def test_nothing_is_lost_when_gaussians_migrate(make, photos, start, blocks):
-    coordinator = make(blocks=blocks, steps=60, density=STILL)
+def test_nothing_is_lost_when_gaussians_migrate(make, photos, start):
+    coordinator = make(blocks=8, steps=60, density=STILL)
     generator = torch.Generator().manual_seed(0)
     ended = listen(coordinator, VisitEnded)
     while not coordinator.finished:
@@ -113,10 +113,10 @@ def test_nothing_is_lost_when_gaussians_migrate(make, photos, start, blocks):
             coordinator.params["means"].add_(0.05 * noise)
         assert coordinator.count() == len(start)
         if coordinator.state.active is None:
-            for b in range(blocks):
+            for b in range(8):
                 means = with_pending(coordinator.scene, b).gaussians.means
                 assert bool((coordinator.scene.tree.assign(means) == b).all())
-    assert (sum(event.migrated for event in ended) > 0) == (blocks > 1)
+    assert sum(event.migrated for event in ended) > 0
 
 
 def test_migrants_take_their_moments_along(make, photos):
@@ -146,16 +146,6 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, bloc
     _, resumed = assert_resumes(make, photos, *stops, **options)
     store = resumed.scene.store
     assert LIVE not in store.blocks or store.counts(LIVE) == 0
-
-
-def test_the_same_seed_gives_the_same_run_and_another_another(make, photos):
-    results = []
-    for number, seed in enumerate((0, 0, 1)):
-        coordinator = make(str(number), blocks=3, steps=25, density=GROWING, seed=seed)
-        train(coordinator, photos)
-        results.append(whole_scene(coordinator))
-    assert equal(results[0], results[1])
-    assert not equal(results[0], results[2])
 
 
 def test_blocks_that_no_view_sees_are_left_alone(make, photos, start):
@@ -246,8 +236,7 @@ def test_the_state_of_a_run_survives_json(make, photos):
     assert again.active.geometry.crops == state.active.geometry.crops
 
 
-@pytest.mark.parametrize("pass_gaussians", [0, 30])
-@BOTH
+@pytest.mark.parametrize(("pass_gaussians", "primitive"), [(30, "3dgs"), (0, "2dgs")])
 def test_the_sandwich_of_a_sample_is_the_merged_picture(make, views, start, pass_gaussians, primitive):
     """What a step sees of the scene, before any training, is what a viewer would see."""
     options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians, "primitive": primitive}

@@ -55,17 +55,6 @@ def test_refinement_keeps_to_its_share_of_the_run(progress, expected):
     assert DensityControl(DensityConfig()).is_due(clock(progress=progress)) is expected
 
 
-def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
-    late = {"progress": 0.6, "refined": 0, "spent": 0.1}
-    control = DensityControl(DensityConfig())
-    assert control.is_due(clock(first=True, **late))
-    assert not control.is_due(clock(first=True, **{**late, "progress": 0.71}))
-    assert not control.is_due(clock(**late))
-    assert not control.is_due(clock(first=True, **{**late, "spent": 0.6}))
-    never = DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0))
-    assert not never.is_due(clock(first=True, **late))
-
-
 @pytest.mark.parametrize("steps", [17, 32, 39, 64])
 def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
     """It was refined in the warm-up, just now perhaps; later visits count from the one before."""

@@ -8,7 +8,7 @@ import torch
 
 from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
@@ -51,7 +51,7 @@ def test_a_healthy_run_is_the_same_with_and_without(make, photos, monkeypatch):
     assert equal(*results)
 
 
-@pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
+@pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (1e30, 1)])
 def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(make, photos, value, blocks):
     coordinator = make(blocks=blocks, steps=12, density=GROWING)
     told = listen(coordinator, Repaired)
@@ -100,9 +100,8 @@ def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos)
     assert float(torch.sigmoid(coordinator.params["opacities"].detach()[0])) < 1 / 255
 
 
-@pytest.mark.parametrize("blocks", [1, 2])
-def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make, views, photos, blocks):
-    coordinator = make(blocks=blocks, steps=30)
+def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make, views, photos):
+    coordinator = make(blocks=2, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
     with torch.no_grad():
@@ -156,16 +155,6 @@ def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
     assert coordinator.params["scales"][:2].amax(dim=1).tolist() == pytest.approx([6.0, 5.0], abs=0.1)
 
 
-def test_a_value_that_is_no_number_bounds_nothing(make, views, photos):
-    coordinator = make(blocks=1, steps=30, density=STILL)
-    train_step(coordinator, photos)
-    with torch.no_grad():
-        coordinator.params["means"][0] = coordinator.params["scales"][1] = math.nan
-    nobody = torch.zeros(len(coordinator.params["means"]), dtype=torch.bool)
-    largest = coordinator.health.largest(views, nobody)
-    assert bool((largest[:2] > 40).all())
-
-
 def test_stand_ins_are_numbers_even_among_none():
     for sound in (random_gaussians(7), Gaussians.empty(1)):
         made = stand_ins(sound, 3)
@@ -173,11 +162,11 @@ def test_stand_ins_are_numbers_even_among_none():
         assert not bool(unsound(made).any())
 
 
-@pytest.mark.parametrize("name", PARAM_NAMES)
-def test_every_parameter_is_looked_at(name):
-    gaussians = random_gaussians(5)
-    getattr(gaussians, name)[3].view(-1)[-1] = math.nan
-    assert unsound(gaussians).tolist() == [False, False, False, True, False]
+def test_every_parameter_is_looked_at():
+    for name in PARAM_NAMES:
+        gaussians = random_gaussians(5)
+        getattr(gaussians, name)[3].view(-1)[-1] = math.nan
+        assert unsound(gaussians).tolist() == [False, False, False, True, False], name
 
 
 def test_how_blocks_stand_is_said_in_words():
@@ -215,21 +204,7 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
         train_step(coordinator, photos)
 
 
-@pytest.mark.parametrize(("seen", "expected"), [(3, 3), (3000, 40)])
-def test_blocks_are_refined_once_a_visit_however_many_views_there_are(make, photos, seen, expected):
-    coordinator = make(blocks=2, steps=200, visit_steps=10)
-    train_step(coordinator, photos)
-    coordinator.state.active.showing = tuple(range(seen))
-    clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
-    assert (clock.views, min(clock.views, clock.visit)) == (seen, expected)
-    control = DensityControl(DensityConfig(refine_every=1))
-    due = replace(clock, progress=0.02, refined=0, first=False)
-    assert control.is_due(replace(due, steps=expected))
-    assert not control.is_due(replace(due, steps=expected - 1))
-
-
-@pytest.mark.parametrize("blocks", [1, 3])
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize(("blocks", "strategy"), [(1, "default"), (3, "mcmc")])
 def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks, strategy):
     """All its Gaussians may be pruned; the run goes on, and can be resumed."""
     density = DensityConfig(strategy, refine_start=0.0)

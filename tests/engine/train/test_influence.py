@@ -74,12 +74,6 @@ def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(grown
     assert {block for block, _, looked_at in seen if looked_at} == {0, 1, 2, 3}
 
 
-def test_with_a_share_of_one_every_view_counts(grown, photos):
-    coordinator = grown(influence_share=1.0)
-    train(coordinator, photos)
-    assert all(count == 5 for count in coordinator.state.views.values())
-
-
 def assert_known_is_what_shows(coordinator, views, rel: float) -> None:
     """Each view's influence, of all blocks together."""
     whole, known = whole_scene(coordinator), coordinator.state.influence.values()
@@ -113,15 +107,6 @@ def test_what_is_drawn_in_part_is_drawn_again_to_know_its_influence(begin, views
     while coordinator.state.visit < 2:
         train(coordinator, photos, steps=1)
     assert_known_is_what_shows(coordinator, views, rel=0.15)
-
-
-def test_a_block_looks_at_a_doubtful_view_that_sees_it(grown, monkeypatch):
-    coordinator = grown()
-    asked_of(coordinator, monkeypatch, blind=(1, 2, 4))
-    coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
-    active = coordinator.visits.begin()
-    assert active.views == (0, 3)
-    assert active.looked_at == (3,)
 
 
 def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(grown, photos):

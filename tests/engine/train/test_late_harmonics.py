@@ -39,9 +39,10 @@ def test_where_there_is_no_room_they_do_not_come(make, photos):
     assert highest_of(coordinator) == 0
 
 
-@pytest.mark.parametrize("blocks", [1, 4])
-def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks):
-    assert_resumes(make, photos, 30, 47, 60, **{**LATE, "blocks": blocks}, block_limit=ROOMY)
+@pytest.mark.parametrize(("blocks", "stop"), [(1, 47), (4, 60)])
+def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks, stop):
+    """Just before they come, and while they are there."""
+    assert_resumes(make, photos, stop, **{**LATE, "blocks": blocks}, block_limit=ROOMY)
 
 
 def test_while_the_degree_rises_others_see_all_harmonics(make, photos, start):

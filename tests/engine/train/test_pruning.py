@@ -14,7 +14,7 @@ from abcd_ns.engine.gaussians.param_swap import attach, nothing_live
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, faded, floaters, risen
+from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
@@ -89,13 +89,6 @@ def test_a_floater_is_faint_and_fills_more_than_the_mean_of_those_known(several,
             assert goes == (each and px > mean and opacity < bound)
 
 
-def test_what_was_seen_long_ago_counts_for_less():
-    found = faded(statistics([8.0, 8.0], [2.0, 0.6]))
-    assert found["weight"].tolist() == [4.0, 8.0]
-    assert found["passes"].tolist() == pytest.approx([1.0, 0.6])
-    assert found["worth"].tolist() == [1.0, 1.0]
-
-
 @pytest.mark.parametrize(
     ("progress", "ends", "expected"),
     [(0.0, 0.5, 0.0), (0.25, 0.5, 1.5), (0.5, 0.5, 3.0), (0.69, 0.5, 3.0), (0.7, 0.5, 0.0), (0.0, 0.0, 3.0)],
@@ -104,10 +97,9 @@ def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(
     assert risen(3.0, progress, ends) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("blocks", [1, 4])
-def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, blocks):
+def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos):
     density = replace(STILL, min_contribution=1.0)
-    coordinator = make(start=some_hidden(), blocks=blocks, steps=80, density=density, batch=1)
+    coordinator = make(start=some_hidden(), blocks=4, steps=80, density=density, batch=1)
     told = listen(coordinator, Repaired)
     train(coordinator, photos)
     left = whole_scene(coordinator)
@@ -148,7 +140,7 @@ def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(p
 def test_without_a_price_everything_stays(make, photos):
     coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, min_contribution=0.0))
     train(coordinator, photos)
-    assert coordinator.count() == 120
+    assert coordinator.scene.parameters() == 120 * 23  # and their harmonics
 
 
 def test_statistics_weigh_what_lies_before_the_block(make, views, photos):

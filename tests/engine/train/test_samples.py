@@ -16,7 +16,6 @@ from abcd_ns.engine.train.step.batch import Sample, part_to_draw
 from abcd_ns.engine.train.step.cutouts import ALIGN, random_part
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, View
-from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.rasterizer_scenes import project
 from tests.reference.scenes import STILL, assert_resumes, random_gaussians, ring_of_views, training_config
 
@@ -127,25 +126,15 @@ def test_a_part_of_a_batch_shows_what_the_whole_shows_there(make, room):
         assert torch.equal(picture[small.crop.within(big.crop).slices], part)
 
 
-EACH_ALONE = {
-    "blocks": 2,
-    "kind": independent_trainer,
-    "content": independent_at_rest,
-    "layers": False,
-    "overlap": 0.3,
-    "migrate": False,
-}
-
-
-@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE])
-def test_a_run_on_parts_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, options):
-    assert_resumes(make, photos, 4, steps=10, crop_pixels=600, **options)
-
-
 @pytest.fixture
 def small_pictures(monkeypatch):
     """Pictures of 48 x 36 px are reduced, too."""
     monkeypatch.setattr(schedule, "LEAST_SIDE", 9)
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_a_run_on_reduced_parts_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
+    assert_resumes(make, photos, 6, blocks=4, steps=14, crop_pixels=600, coarse=0.7)
 
 
 def sample_of(view: View, crop: Crop) -> Sample:
@@ -214,8 +203,3 @@ def test_samples_grow_with_the_run(make, photos):
         seen.append(coordinator.run.reduction)
     assert {1, 2, 4} == set(seen)
     assert seen == sorted(seen, reverse=True)
-
-
-@pytest.mark.usefixtures("small_pictures")
-def test_a_run_goes_on_with_the_pictures_it_stopped_at(make, photos):
-    assert_resumes(make, photos, 17, blocks=1, steps=40, coarse=0.7)

@@ -46,13 +46,8 @@ def test_what_cannot_be_parted_is_left_as_it_is():
     tree = build_kd(gaussians.means, 1)
     cut, parts, parents = split_full(tree, {0: BlockState.fresh(gaussians)}, Limits(10))
     assert (cut, list(parts), parents) == (tree, [0], {})
-
-
-def test_the_deferred_is_no_block():
-    gaussians = random_gaussians(50)
-    tree = build_kd(gaussians.means, 1)
-    deferred = BlockState.fresh(gaussians)
-    assert split_full(tree, {DEFERRED: deferred}, Limits(10)) == (tree, {DEFERRED: deferred}, {})
+    deferred = {DEFERRED: BlockState.fresh(random_gaussians(50))}
+    assert split_full(tree, deferred, Limits(10)) == (tree, deferred, {})  # it is no block
 
 
 def test_a_part_is_visited_next_to_the_block_it_came_from():
@@ -75,10 +70,9 @@ def test_a_part_has_had_the_visits_of_the_block_it_came_from():
     assert standing(2, state.health[2], {}) == "trained"
 
 
-@pytest.mark.parametrize("blocks", [1, 2])
-def test_a_run_never_has_a_larger_block_than_it_may(make, photos, blocks, monkeypatch):
+def test_a_run_never_has_a_larger_block_than_it_may(make, photos, monkeypatch):
     monkeypatch.setattr(control, "MOST_NEW", 1.0)
-    limit = 130
+    limit, blocks = 130, 2
     coordinator = make(blocks=blocks, steps=50, density=GROWING, block_limit=limit, warmup=0.0)
     seen, largest = listen(coordinator, object), 0
     while not coordinator.finished:
@@ -116,18 +110,6 @@ def test_a_run_that_was_cut_resumes_bit_for_bit(make, photos):
         train_step(first, photos)
     whole, resumed = assert_resumes(make, photos, first.state.step + 3, **options)
     assert whole.scene.tree == resumed.scene.tree
-
-
-def test_what_need_not_be_cut_is_not_written_again(make):
-    scene = make(blocks=1).scene
-    generation = scene.store.generation
-    cut_at_rest(scene, RunState(), Limits(20, sole_limit=10**6))
-    assert (scene.store.generation, scene.tree.num_blocks) == (generation, 1)
-    cut_at_rest(scene, RunState(), Limits(20))
-    generation = scene.store.generation
-    assert scene.tree.num_blocks > 1
-    cut_at_rest(scene, RunState(), Limits(20))
-    assert scene.store.generation == generation
 
 
 @pytest.mark.parametrize(("blocks", "sole_limit"), [(1, 50), (2, 0)])

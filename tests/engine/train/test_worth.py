@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
-from hypothesis import given
-from hypothesis import strategies as st
 
 from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.train.density.growing import APART, NARROWED
@@ -95,16 +93,6 @@ def test_what_fits_is_worth_nothing_and_a_larger_bound_refuses_more():
     assert float(worth(found, len(VIEWS), 1.1 * gain / pixel)[0]) == 0.0
 
 
-def test_the_native_library_and_torch_ask_for_the_same():
-    gaussians, truth = random_gaussians(30, sh_degree=0), random_gaussians(30, seed=1, sh_degree=0)
-    photos = {view.index: DRAW(truth, view, sh_degree=0).color for view in VIEWS}
-    fast, slow = (
-        judged(gaussians, lambda view: photos[view.index], draw)
-        for draw in (DRAW, TorchRasterizer(use_native=False))
-    )
-    torch.testing.assert_close(fast, slow, rtol=1e-3, atol=1e-3 * float(slow[:, :24].abs().max()))
-
-
 def test_what_is_no_number_counts_for_nothing():
     sums = torch.ones(4, 10)
     sums[1, 4], sums[2, 0] = torch.nan, 0.0
@@ -114,14 +102,6 @@ def test_what_is_no_number_counts_for_nothing():
     assert found[1:3, :24].abs().max() == 0
     assert found[0, :24].abs().max() > 0
     assert found[:, 6:9].abs().max() == found[:, 11].abs().max() == 0  # surfels have two axes
-
-
-@given(st.integers(0, 10**6), st.integers(1, 8))
-def test_of_a_few_views_in_a_row_both_halves_have_some(first, step):
-    halves = [half_of(first + k) for k in range(3)]
-    assert 0 < sum(halves) < 3
-    many = [half_of(first + k * step) for k in range(256)]
-    assert 64 < sum(many) < 192
 
 
 @pytest.mark.parametrize("axes", [2, 3])

@@ -4,14 +4,12 @@ import dataclasses
 from io import StringIO
 from pathlib import Path
 
-import numpy as np
-import pytest
 from PIL import Image
 from rich.console import Console
 
-from abcd_ns.lab.compare.charts import draw_charts, mean_curve
+from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import shown
-from abcd_ns.lab.compare.pictures import draw_pictures, error_map, psnr_of
+from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
@@ -50,16 +48,6 @@ def test_without_a_run_there_is_no_chart_and_without_counts_none_of_gaussians(tm
     assert draw_charts(made_up_results(), tmp_path) == []
     paths = draw_charts(made_up_results(counted(1, 2), made_up_run()), tmp_path)
     assert [path.name for path in paths] == ["speed_accuracy.png", "memory.png"]
-
-
-def test_mean_curve_is_the_mean_of_seeds_and_keeps_every_end():
-    one, other = made_up_run(psnr=20.0), made_up_run(psnr=22.0, seed=1)
-    short = made_up_run(psnr=22.0, seed=1, curve=(*other.curve[:2], other.curve[-1]))
-    points = mean_curve([one, other])
-    assert [psnr for _, psnr in points] == pytest.approx([point.psnr + 1 for point in one.curve])
-    assert [seconds for seconds, _ in points] == pytest.approx([point.seconds for point in one.curve])
-    assert len(mean_curve([one, short])) == 3
-    assert mean_curve([one, short])[-1] == pytest.approx(points[-1])
 
 
 # The table
@@ -154,18 +142,6 @@ def test_notes_say_what_is_missing_and_why():
 
 
 # Pictures
-
-
-def test_errors_are_absolute_differences():
-    photo = np.zeros((2, 3, 3), np.uint8)
-    picture = photo.copy()
-    picture[0, 0] = (255, 0, 0)
-    picture[1, 2] = (51, 51, 51)
-    expected = np.array([[1 / 3, 0, 0], [0, 0, 0.2]])
-    assert error_map(picture, photo) == pytest.approx(expected)
-    assert error_map(photo, picture) == pytest.approx(expected)
-    assert psnr_of(photo + np.uint8(51), photo) == pytest.approx(-20 * np.log10(0.2))
-    assert psnr_of(photo, photo) == float("inf")
 
 
 def test_every_view_that_all_runs_drew_gets_a_figure_of_photo_and_pictures(tmp_path):
