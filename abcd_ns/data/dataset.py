@@ -102,7 +102,7 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             flat = undistortion(lens) if lens.distorted else None
             mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
             if mask is not None and needs_photos:
-                read_size(mask, check_kind=False)
+                read_size(mask, "mask")
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()

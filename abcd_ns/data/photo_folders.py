@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from abcd_ns.data import OPTION
+from abcd_ns.data.colmap_model import IMAGES
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import (
@@ -54,10 +55,15 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
 
 def _hint(scene: Scene) -> str:
     """Where the photos of a COLMAP model seem to lie."""
-    end = f"/{scene.frames[0].name}" if scene.frames and scene.model.is_dir() else None
-    found = (path.as_posix() for path in visible_files(scene.root))
-    at = next((path.removesuffix(end) for path in found if end and path.endswith(end)), None)
-    return f", or set {OPTION}images-path {os.path.relpath(at, scene.root)}" if at else ""
+    if not (scene.frames and scene.model.is_dir()):
+        return ""
+    name, root = scene.frames[0].name, scene.root
+    found = (path.as_posix() for path in visible_files(root))
+    at = next((path.removesuffix(name) for path in found if path.endswith(f"/{name}")), None)
+    above = next((p for p in root.absolute().parents[:3] if (p / IMAGES / name).exists()), None)
+    if above:
+        return f", or give --data {above}"
+    return f", or set {OPTION}images-path {os.path.relpath(at, root)}" if at else ""
 
 
 def as_stored(scene: Scene) -> Scene:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,12 +13,12 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
 from abcd_ns.data import DOWNSCALE, OPTION
-from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_models, read_colmap
+from abcd_ns.data.colmap_model import IMAGES, find_models, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import as_stored, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.picture_files import read_size, visible_files
+from abcd_ns.data.picture_files import SUFFIXES, read_size, visible_files
 from abcd_ns.data.ply import GREY
 from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
@@ -29,6 +30,8 @@ MAX_AUTO_SIDE = 1600
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 _MODEL_FILES = ("cameras.bin", "cameras.txt", f"{TRANSFORMS}.json", f"{TRANSFORMS}_train.json")
 """By which a model is found where nobody looks for it."""
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+_ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z", ".rar")
 
 
 @dataclass
@@ -113,20 +116,41 @@ def read_scene(
         raise InputError(f"{found} names photos and masks itself: {fix}.")
     if found is not None:
         return read_transforms(found) if found == whole else read_split_transforms(data)
-    elsewhere = next((path for path in visible_files(data) if path.name in _MODEL_FILES), None)
-    if elsewhere is not None:
-        folder = elsewhere.parent
-        hint = f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}."
-        if elsewhere.suffix == ".json":
-            hint = f"give --data {elsewhere}."
-    elif data.name in MIP_NERF_360:
-        hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
-    else:
-        hint = f"give a folder with a COLMAP model, or make one of {data}/images with `abcd poses {data}`."
-    if not data.exists():
-        raise InputError(f"--data {data} does not exist; {hint}")
-    looked = ", ".join(f"{folder.replace('*', '0')}/cameras.bin|txt" for folder in MODEL_FOLDERS)
-    raise InputError(f"--data {data} holds no model (looked for {looked} and transforms.json); {hint}")
+    fault = (
+        "holds no model (such as sparse/0/cameras.bin or transforms.json)"
+        if data.exists()
+        else "does not exist"
+    )
+    raise InputError(f"--data {data} {'is a file' if data.is_file() else fault}; {_advice(data)}.")
+
+
+def _advice(data: Path) -> str:
+    """What to do where `data` holds no model."""
+    files = [data] if data.is_file() else list(visible_files(data))
+    models = [path for path in files if path.name in _MODEL_FILES]
+    for place in (*data.absolute().parents[:3], *(above for path in models for above in path.parents[:3])):
+        if (place / f"{TRANSFORMS}.json").exists() or ((place / IMAGES).is_dir() and find_models(place)):
+            return f"give --data {place}"
+    if models:
+        folder = models[0].parent
+        if models[0].suffix == ".json":
+            return f"give --data {models[0]}"
+        return f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}"
+    if data.name in MIP_NERF_360:
+        return f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there"
+    kinds = {path.suffix.lower(): path for path in files}
+    whole = data.with_suffix("") if data.is_file() else data
+    if SUFFIXES.isdisjoint(kinds):  # photos may lie in what there is
+        if video := next((kinds[each] for each in _VIDEOS if each in kinds), None):
+            whole, video = (shlex.quote(str(path)) for path in (whole, video))
+            frames = f"`mkdir -p {whole}/images; ffmpeg -i {video} -r 2 {whole}/images/%04d.jpg`"
+            return f"make photos of the video with {frames}, then `abcd poses {whole} --order video`"
+        if archive := next((kinds[each] for each in _ARCHIVES if each in kinds), None):
+            return f"unpack {archive} and give the folder that comes of it"
+    if data.is_file():
+        return "give the folder that holds the photos and a COLMAP model or a transforms.json"
+    made = f"with `abcd poses {data}`, which reads the photos in {data}/images"
+    return f"give a folder with a COLMAP model, or make one {made}"
 
 
 def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
@@ -218,7 +242,7 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSou
     for frame in scene.frames:
         if frame.mask_path is not None:
             with problems.collect():  # measured before it is decoded
-                read_size(frame.mask_path, check_kind=False)
+                read_size(frame.mask_path, "mask")
     try:
         with problems.collect():
             files, notes = locate_photos(scene, factor)
