@@ -58,8 +58,6 @@ class SceneOptions(DataParserConfig):
     it to downscale_factor, which counts where both are given."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
-    scene_scale: float = 1.0
-    """Half the side of the scene box, in scaled units: for methods that have one, which ABCD does not."""
     orientation_method: Orientation = "up"
     """How the scene is turned. up: the mean of the cameras' up vectors becomes +z."""
     center_method: Center = "poses"

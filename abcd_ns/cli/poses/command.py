@@ -45,8 +45,8 @@ def poses(
     Args:
         data: Folder of the scene.
         order: "any" compares each photo with each. "video" compares it with those that follow by name.
-        lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
-            without distortion.
+        lens: COLMAP's camera model. OPENCV suits phones and cameras.
+            OPENCV_FISHEYE suits fisheyes, PINHOLE photos without distortion.
         several_lenses: The photos are of several lenses, or zoomed. Assumed where their sizes differ.
         seed: Seed of pycolmap's random choices.
 
