@@ -127,24 +127,25 @@ def _advice(data: Path) -> str:
     files = [data] if data.is_file() else list(visible_files(data))
     models = [path for path in files if path.name in _MODEL_FILES]
     for place in (*data.absolute().parents[:3], *(above for path in models for above in path.parents[:3])):
-        if (place / f"{TRANSFORMS}.json").exists() or ((place / IMAGES).is_dir() and find_models(place)):
+        named = any((place / name).exists() for name in _MODEL_FILES if name.endswith(".json"))
+        if named or ((place / IMAGES).is_dir() and find_models(place)):
             return f"give --data {place}"
     if models:
         folder = models[0].parent
-        if models[0].suffix == ".json":
-            return f"give --data {models[0]}"
         return f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}"
     if data.name in MIP_NERF_360:
         return f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there"
-    kinds = {path.suffix.lower(): path for path in files}
-    whole = data.with_suffix("") if data.is_file() else data
-    if SUFFIXES.isdisjoint(kinds):  # photos may lie in what there is
-        if video := next((kinds[each] for each in _VIDEOS if each in kinds), None):
-            whole, video = (shlex.quote(str(path)) for path in (whole, video))
-            frames = f"`mkdir -p {whole}/images; ffmpeg -i {video} -r 2 {whole}/images/%04d.jpg`"
-            return f"make photos of the video with {frames}, then `abcd poses {whole} --order video`"
-        if archive := next((kinds[each] for each in _ARCHIVES if each in kinds), None):
-            return f"unpack {archive} and give the folder that comes of it"
+    ends = {path.suffix.lower(): path for path in files}
+    video, archive = (next((ends[e] for e in kind if e in ends), None) for kind in (_VIDEOS, _ARCHIVES))
+    if not SUFFIXES.isdisjoint(ends):  # photos, so that these are beside the point
+        video = archive = None
+    if video:
+        whole = data.with_suffix("") if data.is_file() else data
+        at, film = shlex.quote(str(whole)), shlex.quote(str(video))
+        frames = f"`mkdir -p {at}/images; ffmpeg -i {film} -r 2 {at}/images/%04d.jpg`"
+        return f"make photos of the video with {frames}, then `abcd poses {at} --order video`"
+    if archive:
+        return f"unpack {archive} and give the folder that comes of it"
     if data.is_file():
         return "give the folder that holds the photos and a COLMAP model or a transforms.json"
     made = f"with `abcd poses {data}`, which reads the photos in {data}/images"
@@ -179,9 +180,8 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     problems.raise_if_any()
     sources, lenses = _sources(scene, files)
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
-    turned, centered = options.orientation_method, options.center_method
-    scaled = options.auto_scale_poses, options.scale_factor
-    similarity = normalizing_similarity(poses, turned, centered, *scaled)
+    placed = (options.orientation_method, options.center_method, options.auto_scale_poses)
+    similarity = normalizing_similarity(poses, *placed, options.scale_factor)
     points, in_model, more = _points(scene, similarity)
     lists = scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
@@ -189,10 +189,9 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     masked = sum(source.mask_path is not None for source in sources)
     if 0 < masked < len(sources):
         more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
-    chosen = wanted is None and not options.max_side and factor > 1
-    reduced = [_reduction(scene, sources, factor)] if chosen and needs_photos else []
-    notes = (*scene.notes, *notes, *more)
-    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
+    notes, chosen = (*scene.notes, *notes, *more), wanted is None and not options.max_side and factor > 1
+    reduced = (_reduction(scene, sources, factor),) if chosen and needs_photos else ()
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, reduced)
 
 
 def automatic_factor(scene: Scene, max_side: int = 0) -> int:
@@ -208,7 +207,6 @@ def automatic_factor(scene: Scene, max_side: int = 0) -> int:
 
 
 def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
-    """What was chosen for the user."""
     full = max((frame.lens.size for frame in scene.frames), key=max)
     longest = max(max(source.reduced) for source in sources)
     return (

@@ -107,9 +107,8 @@ class AbcdDataParser(DataParser):
         scene = self.prepared().scene
         if scene.split_lists and self.config.eval_mode == "auto":
             return scene.split_lists.rows([frame.name for frame in scene.frames], split)
-        return split_rows(
-            np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames]), split, self.config
-        )
+        centers = np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames])
+        return split_rows(centers, split, self.config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **_kwargs: Any) -> AbcdDataparserOutputs:
         prepared, rows, as_stored = self.prepared(), self.rows(split), self.config.as_stored

@@ -33,13 +33,7 @@ MIRRORED = {
     "primitive": "primitive",
 }
 """The model's options that nerfstudio's tools and viewers read, and those of `training` that set them."""
-HONOURED = {
-    "random_init",
-    "num_random",
-    "random_scale",
-    "rasterize_mode",
-    "color_corrected_metrics",
-}
+HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode", "color_corrected_metrics"}
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
 TOLERATED = {"eval_num_rays_per_chunk"}
 """ns-render sets it for all methods; pictures of Gaussians are not drawn by rays."""
@@ -90,8 +84,7 @@ UNUSED_OF_MODEL = {
 """Options of splatfacto's model that ABCD has no use for, and why."""
 UNUSED = {
     "gradient_accumulation_steps": "a step draws as many views as --pipeline.training.batch says",
-    "mixed_precision": "ABCD trains in float32",
-    "use_grad_scaler": "ABCD trains in float32",
+    **dict.fromkeys(("mixed_precision", "use_grad_scaler"), "ABCD trains in float32"),
     "load_scheduler": "learning rates follow the progress of the run",
     "prompt": "ABCD trains on photos",
 }
@@ -126,14 +119,8 @@ HIDDEN = tuple(
 """Options of splatfacto's model that have no effect, or are set under other names."""
 
 
-NOT_BELOW_0 = (
-    "blocks",
-    "device_budget_gb",
-    "gaussian_bytes",
-    "near_plane",
-    "ram_budget_gb",
-    "datamanager.photo_cache_gb",
-)
+_BUDGETS = ("device_budget_gb", "ram_budget_gb", "datamanager.photo_cache_gb", "gaussian_bytes")
+NOT_BELOW_0 = ("blocks", "near_plane", *_BUDGETS)
 
 
 def check_options(config: TrainerConfig) -> None:

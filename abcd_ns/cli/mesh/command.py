@@ -105,9 +105,7 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
     try:
         import open3d  # noqa: F401
     except (ImportError, OSError) as error:
-        raise UserError(
-            f"open3d, which fuses the depths, is not there ({error}); see `abcd doctor`."
-        ) from None
+        raise UserError(f"open3d, which fuses depths, is not there ({error}); see `abcd doctor`.") from None
 
 
 def _within(box: Box, to: Frame, piece: Piece) -> Piece:

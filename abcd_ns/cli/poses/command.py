@@ -65,9 +65,7 @@ def poses(
         several_lenses = True
         notes.append(f"Photos of {len(sizes)} sizes: assuming several lenses.")
     if order == "any" and len(names) > MANY:
-        notes.append(
-            f"Comparing {len(names)} photos with each other takes hours. For a video: --order video."
-        )
+        notes.append(f"Comparing {len(names)} photos with each other takes hours. For video: --order video.")
     for line in notes:
         print_plain(line, console)
     model = _model(data, Task(photos, names, data / WORK, lens, not several_lenses, order, seed), console)
