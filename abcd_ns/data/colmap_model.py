@@ -51,7 +51,7 @@ def find_models(data: Path) -> list[Path]:
     """The folders of `data` that hold a COLMAP model; that with most photos comes first."""
     globs = (sorted(data.glob(each)) if "*" in each else [data / each] for each in MODEL_FOLDERS)
     places = [place for found in globs for place in found]
-    found = [p for p in places if _part(p, "cameras") and (p != data or _part(p, "images"))]
+    found = [p for p in places if (all if p == data else any)(_part(p, n) for n in ("cameras", "images"))]
     return sorted(found, key=_count_photos, reverse=True) if len(found) > 1 else found
 
 

@@ -16,7 +16,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
 from abcd_ns.data.picture_files import FileFinder, check_complete, read_size
@@ -33,7 +32,6 @@ class AbcdDataset(InputDataset):
 
     Args:
         dataparser_outputs: of AbcdDataParser or any of nerfstudio's.
-        scale_factor: must be 1: the dataparser's `downscale_factor` sets the size of photos.
         budget_bytes: see Photos.
         needs_photos: see `with_photos`.
     """
@@ -41,14 +39,11 @@ class AbcdDataset(InputDataset):
     def __init__(
         self,
         dataparser_outputs: DataparserOutputs,
-        scale_factor: float = 1.0,
         budget_bytes: int | None = None,
         needs_photos: bool = True,
     ):
-        if scale_factor != 1.0:
-            raise InputError(f"camera_res_scale_factor has no effect: set {OPTION}downscale-factor instead.")
         outputs = with_photos(dataparser_outputs, needs_photos)
-        super().__init__(outputs, scale_factor)
+        super().__init__(outputs)
         self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
@@ -85,9 +80,7 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
     sources, lenses, problems, finders = [], [], Problems(), {}
     if not outputs.cameras.camera_to_worlds.isfinite().all():
         fix = "where the reader has an --orientation-method, set it to none"
-        raise InputError(
-            f"{outputs.image_filenames[0]} and others have poses that are NaN or infinite; {fix}."
-        )
+        raise InputError(f"{outputs.image_filenames[0]} and others have poses with NaN or infinity; {fix}.")
     for row, path in enumerate(outputs.image_filenames):
         with problems.collect(name=str(path)):
             lens = _lens(outputs.cameras, row, str(path))
@@ -102,7 +95,7 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             flat = undistortion(lens) if lens.distorted else None
             mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
             if mask is not None and needs_photos:
-                read_size(mask, check_kind=False)
+                read_size(mask, "mask")
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()

@@ -85,7 +85,7 @@ class Problems(list[str]):
         Raises:
             InputError: something was noted.
         """
-        lines = list(self)
+        lines = list(dict.fromkeys(self))
         for first, *others in self._alike.values():
             if len(others) >= FEW:
                 lines[lines.index(first)] += f" {len(others)} others have the same fault."

@@ -4,7 +4,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from abcd_ns.data import OPTION
+from abcd_ns.data import DOWNSCALE, OPTION
+from abcd_ns.data.colmap_model import IMAGES
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import (
@@ -42,9 +43,7 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
         return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
     if not copies:
         count, example = len(scene.frames), next((frame.name for frame in scene.frames), "none")
-        raise InputError(
-            f"{full} does not exist: put the {count} photos there ({example}, ...){_hint(scene)}."
-        )
+        raise InputError(f"{full} is missing: put the {count} photos there ({example}, ...){_hint(scene)}.")
     of = max((n for n in copies if factor % n == 0), default=min(copies))
     if factor % of:
         found = of * max(factor // of, 1)
@@ -54,10 +53,15 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
 
 def _hint(scene: Scene) -> str:
     """Where the photos of a COLMAP model seem to lie."""
-    end = f"/{scene.frames[0].name}" if scene.frames and scene.model.is_dir() else None
-    found = (path.as_posix() for path in visible_files(scene.root))
-    at = next((path.removesuffix(end) for path in found if end and path.endswith(end)), None)
-    return f", or set {OPTION}images-path {os.path.relpath(at, scene.root)}" if at else ""
+    if not (scene.frames and scene.model.is_dir()):
+        return ""
+    name, root = scene.frames[0].name, scene.root
+    found = (path.as_posix() for path in visible_files(root))
+    at = next((path.removesuffix(name) for path in found if path.endswith(f"/{name}")), None)
+    above = next((p for p in root.absolute().parents[:3] if (p / IMAGES / name).exists()), None)
+    if above:
+        return f", or give --data {above}"
+    return f", or set {OPTION}images-path {os.path.relpath(at, root)}" if at else ""
 
 
 def as_stored(scene: Scene) -> Scene:
@@ -127,9 +131,7 @@ def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> li
 def _reduce(label: str, size: tuple[int, int], factor: int) -> tuple[int, int]:
     width, height = size[0] // factor, size[1] // factor
     if width == 0 or height == 0:
-        raise InputError(
-            f"{label}: {OPTION}downscale-factor leaves nothing of {size[0]} x {size[1]} px; lower it."
-        )
+        raise InputError(f"{label}: {DOWNSCALE} leaves nothing of {size[0]} x {size[1]} px; lower it.")
     return width, height
 
 

@@ -218,9 +218,7 @@ def _read_photo(source: PhotoSource) -> Tensor:
     flat = source.undistortion
     if flat or source.reduced != source.stored:
         reduced = partial(area_reduce, size=source.reduced)
-        image = weighted_by_alpha(
-            image, lambda pixels: flat.apply(reduced(pixels)) if flat else reduced(pixels)
-        )
+        image = weighted_by_alpha(image, lambda px: flat.apply(reduced(px)) if flat else reduced(px))
     return torch.from_numpy(image)
 
 
@@ -229,9 +227,7 @@ def _read_mask(source: PhotoSource) -> Tensor:
     width, height = source.reduced
     if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
         shape = f"{mask.shape[1]} x {mask.shape[0]}"
-        raise InputError(
-            f"{source.mask_path}: {shape} px, unlike its photo ({width} x {height}); replace it."
-        )
+        raise InputError(f"{source.mask_path}: {shape}, unlike its photo ({width} x {height}); replace it.")
     used = area_reduce(mask * np.uint8(_MASK_USED), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)
     if source.undistortion:

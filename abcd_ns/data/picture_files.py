@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
+from typing import Literal
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
@@ -139,31 +140,31 @@ def orientation(picture: Image.Image) -> int:
 
 def undecodable(path: Path, error: Exception) -> InputError:
     """What to say of a file whose header is sound and whose pixels are not."""
-    return InputError(f"{path} cannot be decoded ({error}); copy the photo again.")
+    return InputError(f"{path} cannot be decoded ({error}); copy it again.")
 
 
-def read_size(path: Path, check_kind: bool = True) -> tuple[int, int]:
+def read_size(path: Path, kind: Literal["photo", "mask"] = "photo") -> tuple[int, int]:
     """(width, height) of a photo or mask as stored: EXIF orientation is not applied, as COLMAP does not.
     Reads a few hundred bytes. Not thread-safe (it sets warning filters).
 
     Args:
-        check_kind: refuse what is not converted to 8-bit RGB without loss; of masks it does not matter.
+        kind: of photos, what is not converted to 8-bit RGB without loss is refused.
     """
-    check_regular(path)
+    check_regular(path, kind)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with open_picture(path) as picture:
-                if check_kind:
+                if kind == "photo":
                     _check_kind(path, picture)
                 return picture.size
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
-        fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
-        raise InputError(f"{path} has more than 500 Mpx; {fix}.") from None
+        more = " and make the model again" if kind == "photo" else ""
+        raise InputError(f"{path} has more than 500 Mpx; reduce the {kind}{more}.") from None
     except UnidentifiedImageError:
         raise InputError(f"{path} is not a picture of a known kind; save it as JPEG or PNG.") from None
     except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
+        raise InputError(f"{path} is damaged ({error}); copy the {kind} again.") from None
 
 
 def is_turned(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,12 +13,12 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
 from abcd_ns.data import DOWNSCALE, OPTION
-from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_models, read_colmap
+from abcd_ns.data.colmap_model import IMAGES, find_models, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import as_stored, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.picture_files import read_size, visible_files
+from abcd_ns.data.picture_files import SUFFIXES, read_size, visible_files
 from abcd_ns.data.ply import GREY
 from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
@@ -29,6 +30,8 @@ MAX_AUTO_SIDE = 1600
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 _MODEL_FILES = ("cameras.bin", "cameras.txt", f"{TRANSFORMS}.json", f"{TRANSFORMS}_train.json")
 """By which a model is found where nobody looks for it."""
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+_ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z", ".rar")
 
 
 @dataclass
@@ -55,8 +58,6 @@ class SceneOptions(DataParserConfig):
     it to downscale_factor, which counts where both are given."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
-    scene_scale: float = 1.0
-    """Half the side of the scene box, in scaled units: for methods that have one, which ABCD does not."""
     orientation_method: Orientation = "up"
     """How the scene is turned. up: the mean of the cameras' up vectors becomes +z."""
     center_method: Center = "poses"
@@ -113,20 +114,42 @@ def read_scene(
         raise InputError(f"{found} names photos and masks itself: {fix}.")
     if found is not None:
         return read_transforms(found) if found == whole else read_split_transforms(data)
-    elsewhere = next((path for path in visible_files(data) if path.name in _MODEL_FILES), None)
-    if elsewhere is not None:
-        folder = elsewhere.parent
-        hint = f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}."
-        if elsewhere.suffix == ".json":
-            hint = f"give --data {elsewhere}."
-    elif data.name in MIP_NERF_360:
-        hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
-    else:
-        hint = f"give a folder with a COLMAP model, or make one of {data}/images with `abcd poses {data}`."
-    if not data.exists():
-        raise InputError(f"--data {data} does not exist; {hint}")
-    looked = ", ".join(f"{folder.replace('*', '0')}/cameras.bin|txt" for folder in MODEL_FOLDERS)
-    raise InputError(f"--data {data} holds no model (looked for {looked} and transforms.json); {hint}")
+    fault = (
+        "holds no model (such as sparse/0/cameras.bin or transforms.json)"
+        if data.exists()
+        else "does not exist"
+    )
+    raise InputError(f"--data {data} {'is a file' if data.is_file() else fault}; {_advice(data)}.")
+
+
+def _advice(data: Path) -> str:
+    """What to do where `data` holds no model."""
+    files = [data] if data.is_file() else list(visible_files(data))
+    models = [path for path in files if path.name in _MODEL_FILES]
+    for place in (*data.absolute().parents[:3], *(above for path in models for above in path.parents[:3])):
+        named = any((place / name).exists() for name in _MODEL_FILES if name.endswith(".json"))
+        if named or ((place / IMAGES).is_dir() and find_models(place)):
+            return f"give --data {place}"
+    if models:
+        folder = models[0].parent
+        return f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}"
+    if data.name in MIP_NERF_360:
+        return f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there"
+    ends = {path.suffix.lower(): path for path in files}
+    video, archive = (next((ends[e] for e in kind if e in ends), None) for kind in (_VIDEOS, _ARCHIVES))
+    if not SUFFIXES.isdisjoint(ends):  # photos, so that these are beside the point
+        video = archive = None
+    if video:
+        whole = data.with_suffix("") if data.is_file() else data
+        at, film = shlex.quote(str(whole)), shlex.quote(str(video))
+        frames = f"`mkdir -p {at}/images; ffmpeg -i {film} -r 2 {at}/images/%04d.jpg`"
+        return f"make photos of the video with {frames}, then `abcd poses {at} --order video`"
+    if archive:
+        return f"unpack {archive} and give the folder that comes of it"
+    if data.is_file():
+        return "give the folder that holds the photos and a COLMAP model or a transforms.json"
+    made = f"with `abcd poses {data}`, which reads the photos in {data}/images"
+    return f"give a folder with a COLMAP model, or make one {made}"
 
 
 def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
@@ -157,9 +180,8 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     problems.raise_if_any()
     sources, lenses = _sources(scene, files)
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
-    turned, centered = options.orientation_method, options.center_method
-    scaled = options.auto_scale_poses, options.scale_factor
-    similarity = normalizing_similarity(poses, turned, centered, *scaled)
+    placed = (options.orientation_method, options.center_method, options.auto_scale_poses)
+    similarity = normalizing_similarity(poses, *placed, options.scale_factor)
     points, in_model, more = _points(scene, similarity)
     lists = scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
@@ -167,10 +189,9 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     masked = sum(source.mask_path is not None for source in sources)
     if 0 < masked < len(sources):
         more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
-    chosen = wanted is None and not options.max_side and factor > 1
-    reduced = [_reduction(scene, sources, factor)] if chosen and needs_photos else []
-    notes = (*scene.notes, *notes, *more)
-    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
+    notes, chosen = (*scene.notes, *notes, *more), wanted is None and not options.max_side and factor > 1
+    reduced = (_reduction(scene, sources, factor),) if chosen and needs_photos else ()
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, reduced)
 
 
 def automatic_factor(scene: Scene, max_side: int = 0) -> int:
@@ -186,7 +207,6 @@ def automatic_factor(scene: Scene, max_side: int = 0) -> int:
 
 
 def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
-    """What was chosen for the user."""
     full = max((frame.lens.size for frame in scene.frames), key=max)
     longest = max(max(source.reduced) for source in sources)
     return (
@@ -218,7 +238,7 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSou
     for frame in scene.frames:
         if frame.mask_path is not None:
             with problems.collect():  # measured before it is decoded
-                read_size(frame.mask_path, check_kind=False)
+                read_size(frame.mask_path, "mask")
     try:
         with problems.collect():
             files, notes = locate_photos(scene, factor)

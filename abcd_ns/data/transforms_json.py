@@ -125,7 +125,7 @@ def _number(values: dict[str, Any], key: str, label: str, default: float | None 
     value = values.get(key, default)
     # Compared rather than converted: JSON's whole numbers may be larger than any float.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
-        raise InputError(f"{label}: {key} must be a number, not {value}.")
+        raise InputError(f"{label}: {key} must be a number, not {json.dumps(value)}.")
     return float(value)
 
 
@@ -141,10 +141,12 @@ def _frame(path: Path, files: FileFinder, meta: dict, entry: dict, number: int) 
     if not isinstance(name, str) or not name:
         raise InputError(f"{path}: frame {number} has no file_path; remove it or name its photo.")
     label = f"{path}: {name}"
+    if entry.get("transform_matrix") is None:
+        raise InputError(f"{label} has no transform_matrix; add its pose, or remove the frame.")
     if not Path(name).suffix and not (path.parent / name).exists():
         name += ".png"
     photo = files.find(name)
-    pose = rigid(_matrix(entry.get("transform_matrix"), label), f"{label}: transform_matrix")
+    pose = rigid(_matrix(entry["transform_matrix"], label), f"{label}: transform_matrix")
     lens = _lens(_camera_values(meta, entry), label, photo)
     mask = files.find(str(entry["mask_path"])) if entry.get("mask_path") else None
     # As nerfstudio has it, names are relative to the folder that transforms.json lies in.

@@ -49,20 +49,18 @@ DataFormat = tyro.conf.OmitSubcommandPrefixes[
 ]
 """A subcommand for each of READERS; None by default."""
 
+_TURNS = "each block takes its views in shuffled turns"
+_CHOICES = ("num_images_to_sample_from", "num_times_to_repeat_images", "image_indices")
 UNUSED = {
     "cache_images": "photos are kept on the device and in RAM as far as --pipeline.ram-budget-gb and "
     "--pipeline.device-budget-gb allow",
     "cache_images_type": "photos are kept as they are stored, 8 bits a channel",
-    "images_on_gpu": "photos are kept on the device as far as --pipeline.device-budget-gb allows",
-    "masks_on_gpu": "masks are kept on the device as far as --pipeline.device-budget-gb allows",
+    **dict.fromkeys(("images_on_gpu", "masks_on_gpu"), "--pipeline.device-budget-gb decides what is kept"),
     "max_thread_workers": "photos are read ahead of the steps on a GPU, and on a CPU when they are needed",
-    "train_cameras_sampling_strategy": "each block takes its views in shuffled turns",
+    **dict.fromkeys(("train_cameras_sampling_strategy", "fps_reset_every"), _TURNS),
     "train_cameras_sampling_seed": "the order of views follows --machine.seed",
-    "fps_reset_every": "each block takes its views in shuffled turns",
     "camera_res_scale_factor": "the reader of data reduces photos, by its --downscale-factor",
-    "eval_num_images_to_sample_from": "all held-out photos are evaluated",
-    "eval_num_times_to_repeat_images": "all held-out photos are evaluated",
-    "eval_image_indices": "all held-out photos are evaluated",
+    **{f"eval_{name}": "all held-out photos are evaluated" for name in _CHOICES},
 }
 """Options of nerfstudio's datamanager that ABCD has no use for, and why."""
 

@@ -107,9 +107,8 @@ class AbcdDataParser(DataParser):
         scene = self.prepared().scene
         if scene.split_lists and self.config.eval_mode == "auto":
             return scene.split_lists.rows([frame.name for frame in scene.frames], split)
-        return split_rows(
-            np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames]), split, self.config
-        )
+        centers = np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames])
+        return split_rows(centers, split, self.config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **_kwargs: Any) -> AbcdDataparserOutputs:
         prepared, rows, as_stored = self.prepared(), self.rows(split), self.config.as_stored
@@ -118,11 +117,10 @@ class AbcdDataParser(DataParser):
         if as_stored and 0 < len(masks) < len(sources):
             raise InputError(f"{self.config.data}: only ABCD's methods take masks for some of the photos.")
         original = prepared.similarity.after(prepared.scene.applied_transform, prepared.scene.applied_scale)
-        reach = self.config.scene_scale
         return AbcdDataparserOutputs(
             image_filenames=[source.path for source in sources],
             cameras=stored_cameras(prepared, rows) if as_stored else _cameras(prepared, rows),
-            scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3])),
             mask_filenames=masks if len(masks) == len(sources) > 0 else None,
             metadata={**({} if as_stored else {PHOTOS: sources}), **prepared.points},
             dataparser_transform=torch.from_numpy(original.matrix),

@@ -20,6 +20,11 @@ from abcd_ns.errors import UserError
 
 METHODS = "abcd"
 """What the names of all our methods begin with."""
+UNUSED_OF_VIEWER = {
+    "num_rays_per_chunk": "it is about rays, and Gaussians are not drawn by rays",
+    "relative_log_filename": "the viewer writes no log",
+}
+"""Options of nerfstudio's viewer that ABCD has no use for, and why."""
 UNUSED_OF_MACHINE = dict.fromkeys(
     ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
 )
@@ -197,7 +202,7 @@ class AbcdMachineConfig(MachineConfig):
 
 
 @shown("websocket_port", "websocket_host", "quit_on_train_completion")
-@hidden("num_rays_per_chunk")
+@hidden(*UNUSED_OF_VIEWER)
 @dataclasses.dataclass
 class AbcdViewerConfig(ViewerConfig):
     """nerfstudio's viewer, fewer of its options in the help."""

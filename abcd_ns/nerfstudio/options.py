@@ -20,7 +20,7 @@ from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
-from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, hidden, named_too, shown
+from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, UNUSED_OF_VIEWER, hidden, named_too, shown
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
 
@@ -33,13 +33,7 @@ MIRRORED = {
     "primitive": "primitive",
 }
 """The model's options that nerfstudio's tools and viewers read, and those of `training` that set them."""
-HONOURED = {
-    "random_init",
-    "num_random",
-    "random_scale",
-    "rasterize_mode",
-    "color_corrected_metrics",
-}
+HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode", "color_corrected_metrics"}
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
 TOLERATED = {"eval_num_rays_per_chunk"}
 """ns-render sets it for all methods; pictures of Gaussians are not drawn by rays."""
@@ -90,8 +84,7 @@ UNUSED_OF_MODEL = {
 """Options of splatfacto's model that ABCD has no use for, and why."""
 UNUSED = {
     "gradient_accumulation_steps": "a step draws as many views as --pipeline.training.batch says",
-    "mixed_precision": "ABCD trains in float32",
-    "use_grad_scaler": "ABCD trains in float32",
+    **dict.fromkeys(("mixed_precision", "use_grad_scaler"), "ABCD trains in float32"),
     "load_scheduler": "learning rates follow the progress of the run",
     "prompt": "ABCD trains on photos",
 }
@@ -100,7 +93,7 @@ NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are 
 UNUSED_OF_OPTIMIZERS = {
     "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",
     "bilateral_grid": _GRIDS,
-    "*.scheduler.*": "rates follow the run",
+    "*.scheduler": "rates follow the run",
     "*.optimizer.max_norm": NOT_CLIPPED,
     "*.optimizer.fused": "a parameter and its moments are updated by one kernel in any case",
 }
@@ -112,7 +105,7 @@ NO_FLAGS = {
     **{f"pipeline.model.{name}": why for name, why in UNUSED_OF_MODEL.items()},
     **{f"pipeline.datamanager.{name}": why for name, why in UNUSED_OF_DATA.items()},
     **{f"optimizers.{name}": why for name, why in UNUSED_OF_OPTIMIZERS.items()},
-    "viewer.num_rays_per_chunk": _RAYS,
+    **{f"viewer.{name}": why for name, why in UNUSED_OF_VIEWER.items()},
     "pipeline.training.seed": SEED,
     "pipeline.training.recipe": "choose another method; `abcd compare --vary` can change parts of one",
     "pipeline.training.limits": "they follow from --pipeline.device-budget-gb",
@@ -126,14 +119,8 @@ HIDDEN = tuple(
 """Options of splatfacto's model that have no effect, or are set under other names."""
 
 
-NOT_BELOW_0 = (
-    "blocks",
-    "device_budget_gb",
-    "gaussian_bytes",
-    "near_plane",
-    "ram_budget_gb",
-    "datamanager.photo_cache_gb",
-)
+_BUDGETS = ("device_budget_gb", "ram_budget_gb", "datamanager.photo_cache_gb", "gaussian_bytes")
+NOT_BELOW_0 = ("blocks", "near_plane", *_BUDGETS)
 
 
 def check_options(config: TrainerConfig) -> None:
@@ -163,6 +150,7 @@ def check_options(config: TrainerConfig) -> None:
         raise UserError(_no_effect("pipeline.training.seed", SEED))
     refuse_changed(config, UNUSED, "")
     refuse_changed(config.machine, UNUSED_OF_MACHINE, "machine.")
+    refuse_changed(config.viewer, UNUSED_OF_VIEWER, "viewer.")
     refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():
         if group["optimizer"].max_norm is not None:

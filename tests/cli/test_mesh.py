@@ -216,7 +216,7 @@ def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path, monkeypatch
         with pytest.raises(UserError, match=words):
             mesh(run, **{"data": photos, "out": out, **options})
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(UserError, match="open3d, which fuses the depths, is not there"):
+    with pytest.raises(UserError, match="open3d, which fuses depths, is not there"):
         mesh(run, data=photos, out=out)
     assert list(tmp_path.iterdir()) == []
 

@@ -22,19 +22,26 @@ ELSEWHERE = {"--ImageReader.single-camera", "--mask-color", "--at", "--output-pa
 """Of colmap, of nerfstudio's reader nerfstudio-data, of the report's style, of ns-eval, and of `abcd`."""
 
 
+def help_of(target: Any, columns: int, **options: Any) -> str:
+    """What a command says to --help."""
+    text = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text), suppress(SystemExit):
+        patch.setenv("COLUMNS", str(columns))
+        tyro.cli(target, args=["--help"], **options)
+    return text.getvalue()
+
+
+def commands() -> list[Any]:
+    return [command.load() for command in cli.COMMANDS if not command.passes_on]
+
+
 @cache
 def known_flags() -> set[str]:
     """The options of all commands, as their helps have them, and the beginnings of dotted ones."""
-    commands: list[Any] = [command.load() for command in cli.COMMANDS if not command.passes_on]
-    text, ns_train = io.StringIO(), methods.abcd.config
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text):
-        patch.setenv("COLUMNS", "400")
-        for target in (*commands, RunViewer, AbcdDataParserConfig):
-            with suppress(SystemExit):
-                tyro.cli(target, args=["--help"])
-        with suppress(SystemExit):
-            tyro.cli(type(ns_train), args=["--help"], default=ns_train)
-    flags = {flag.replace("_", "-") for flag in FLAG.findall(text.getvalue())} | ELSEWHERE
+    ns_train = methods.abcd.config
+    helps = [help_of(target, 400) for target in (*commands(), RunViewer, AbcdDataParserConfig)]
+    helps.append(help_of(type(ns_train), 400, default=ns_train))
+    flags = {flag.replace("_", "-") for text in helps for flag in FLAG.findall(text)} | ELSEWHERE
     return flags | {flag[:place] for flag in flags for place, letter in enumerate(flag) if letter == "."}
 
 
@@ -51,3 +58,9 @@ def test_every_option_that_a_message_names_exists():
     paths = [path for room in rooms for path in (PACKAGE / room).rglob("*.py")]
     assert {path.name: found for path in paths if (found := unknown(path.read_text()))} == {}
     assert unknown('f"Use --picturs {n}."') == ["--picturs"]
+
+
+def test_no_help_begins_a_line_within_a_sentence():
+    """tyro breaks lines where docstrings have them."""
+    lines = [line for target in commands() for line in help_of(target, 160).splitlines()]
+    assert [line for line in lines if re.match(r" {6,}[a-z]", line)] == []

@@ -136,8 +136,6 @@ def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
         assert data["image"].shape == (camera.height.item(), camera.width.item(), 3)
         assert torch.equal(dataset[i]["image"], data["image"].float() / 255)
     assert sorted(scene.rglob("*")) == before
-    with pytest.raises(InputError, match="downscale-factor"):
-        AbcdDataset(outputs, scale_factor=0.5)
 
 
 def test_zero_distortion_is_a_pinhole(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import shutil
 import struct
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from abcd_ns.data.picture_files import read_size
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
+    parser,
     png_that_claims,
     refusal,
     write_capture,
@@ -36,6 +38,49 @@ def test_missing_scene_says_where_to_get_it(tmp_path):
     assert "does not exist" in said
     assert "jonbarron.info/mipnerf360" in said
     assert "sparse/0/cameras.bin" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("level", ["scan/images", "scan/sparse", "scan/sparse/0", "scan/images/left", "."])
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_folder_above_or_below_the_scene_is_answered_by_the_right_one(tmp_path, level, kind):
+    """What the message advises can be read."""
+    write_capture(tmp_path / "scan")
+    if kind == "transforms":
+        write_transforms(tmp_path / "scan")
+        (tmp_path / "scan/sparse/0").mkdir(parents=True)
+    said = refusal(tmp_path / level)
+    (advised,) = re.findall(r"give --data (\S+)\.$", said)
+    assert len(said.splitlines()) == 1
+    parser(Path(advised)).get_dataparser_outputs()
+
+
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("walk.MP4", "ffmpeg -i .*walk.MP4 .*walk/images/.*, then `abcd poses .*walk "),
+        ("scan.zip", "unpack .*scan.zip"),
+        ("a.jpg", "give the folder"),
+        ("points.ply", "give the folder"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_answered_by_what_to_do_with_it(tmp_path, name, fix):
+    (tmp_path / name).write_bytes(b"x")
+    said = refusal(tmp_path / name)
+    assert re.search(f"{name} is a file.*{fix}", said)
+    assert f"{name}/images" not in said
+
+
+@pytest.mark.parametrize(("name", "fix"), [("walk.mov", "ffmpeg"), ("scan.zip", "unpack")])
+def test_a_folder_with_a_video_or_an_archive_alone_is_answered_by_what_to_do_with_it(tmp_path, name, fix):
+    (tmp_path / name).write_bytes(b"x")
+    assert fix in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("gone", ["cameras", "images"])
+def test_a_model_that_lacks_a_file_is_named_with_it(tmp_path, gone):
+    write_capture(tmp_path)
+    (tmp_path / f"sparse/0/{gone}.bin").unlink()
+    assert f"sparse/0/{gone}.bin cannot be read" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +299,9 @@ def _spoil_pose(row: int, column: int, value: float) -> Callable[[dict], None]:
         (_spoil("transform_matrix", (np.diag([1, 1, -1, 1]) + 0.0).tolist()), "mirrors"),
         (_spoil("transform_matrix", [[1, 0], [0, 1]]), "4 x 4"),
         (_spoil("transform_matrix", [[1, 0], [0]]), "matrix"),
-        (_spoil("transform_matrix", None), "matrix"),
+        (_spoil("transform_matrix", None), "no transform_matrix; add its pose"),
+        (_spoil("fl_x", "500"), 'fl_x must be a number, not "500"'),
+        (_spoil("fl_x", None), "fl_x must be a number, not null"),
         (_spoil("fl_x", -500), "focal length"),
         (_spoil("fl_x", "wide"), "must be a number"),
         (_spoil("w", 0), "size"),

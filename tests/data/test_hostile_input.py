@@ -102,6 +102,19 @@ def test_masks_of_no_use_are_all_found_before_training(scene):
     assert len(lines) == 3
 
 
+def test_one_missing_mask_of_all_photos_is_one_line_that_calls_it_a_mask(scene):
+    write_masks(scene)
+    meta = json.loads((scene / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["mask_path"] = "masks/all.png"
+    rewrite(scene, meta)
+    (line,) = check_refusal(scene)
+    assert line.endswith("masks/all.png cannot be read (No such file or directory); copy the mask there.")
+    (scene / "masks/all.png").write_bytes(b"")
+    (line,) = check_refusal(scene)
+    assert line.endswith("masks/all.png is empty; copy the mask again.")
+
+
 @pytest.mark.parametrize("size", [(30_000, 20_000), (60_000, 60_000)])
 def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
     """A picture of few bytes may fill all memory; Pillow warns of the first size and refuses the other."""

@@ -43,7 +43,7 @@ def test_photos_may_lie_in_another_folder(scene):
     (scene / "images").rename(scene / "undistorted")
     outputs = parser(scene, images_path=Path("undistorted")).get_dataparser_outputs()
     assert {path.parents[1] for path in outputs.image_filenames} == {scene / "undistorted"}
-    assert "images does not exist" in refusal(scene)
+    assert "images is missing" in refusal(scene)
 
 
 @pytest.mark.parametrize("called", ["{stem}.png", "{name}.png", "{name}"])

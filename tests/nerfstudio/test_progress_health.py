@@ -104,7 +104,7 @@ def test_what_is_next_names_the_run_and_how_to_train_what_was_not_visited(coordi
     assert "    abcd report run --data 'my wall'" in lines
     assert "    ns-viewer --load-config run/config.yml" in lines
     what, command = lines[-2:]
-    assert what == "  Train twice as long. 1 of 3 blocks were not visited."
+    assert what == "  Train twice as long, as 1 of 3 blocks were not visited:"
     assert command.endswith("--load-dir run/nerfstudio_models --pipeline.max-seconds 120 --data 'my wall'")
     coordinator.state.step = 1000
     assert "--max-num-iterations 2000" in next_steps(coordinator, "abcd", Path("wall"), Path("run/m"))[-1]

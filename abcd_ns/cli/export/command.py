@@ -53,8 +53,8 @@ def export(
 
     Args:
         run: Folder of the run, outputs/SCENE/METHOD/TIME, or its config.yml.
-        out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb. With --by-block a new folder;
-            its files are .ply, or end as the folder's own name does.
+        out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb.
+            With --by-block a new folder, whose files are .ply, or end as its own name does.
         by_block: Write one file for each block.
         box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
         frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.

@@ -66,15 +66,15 @@ def mesh(
     Args:
         run: Folder of the run, outputs/SCENE/METHOD/TIME.
         data: Folder of the run's photos, as given to `ns-train`. Cameras are read from there.
-        out: A new file that ends in .ply. Until it is complete, 7 bytes for each pixel of all training views
-            lie beside it.
+        out: A new file that ends in .ply.
+            Until it is complete, 7 bytes for each pixel of all training views lie beside it.
         voxel: Side of the voxels, in the units of `frame`. Smaller voxels show more detail and more noise.
             Left out, twice the median width of a pixel on the surface.
         box: Keep only what lies in this box, in the coordinates of `frame`.
         frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
             "nerfstudio" has those of the run, its viewer and `ns-export`.
-        depth: Depth of a pixel. "median" is where half of it is covered. "expected" is the mean, which
-            floaters in front of a wall move off the wall.
+        depth: Depth of a pixel. "median" is where half of it is covered.
+            "expected" is the mean, which floaters in front of a wall move off the wall.
     """
     _check(out, voxel, box)
     run = find_run(find_run(run, SETTINGS_FILE), STORE)
@@ -105,9 +105,7 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
     try:
         import open3d  # noqa: F401
     except (ImportError, OSError) as error:
-        raise UserError(
-            f"open3d, which fuses the depths, is not there ({error}); see `abcd doctor`."
-        ) from None
+        raise UserError(f"open3d, which fuses depths, is not there ({error}); see `abcd doctor`.") from None
 
 
 def _within(box: Box, to: Frame, piece: Piece) -> Piece:

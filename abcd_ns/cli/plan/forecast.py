@@ -45,8 +45,8 @@ class Wanted:
     blocks: Number = 0
     """Number of blocks. 0 takes as few as the device's budget permits."""
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
-    """Memory of the device that training may take. 0 takes 90% of a GPU's free memory, or a quarter of the
-    RAM on a CPU."""
+    """Memory of the device that training may take.
+    0 takes 90% of a GPU's free memory, or a quarter of the RAM on a CPU."""
     max_gaussians: Number = 0
     """Limit on Gaussians in the scene. 0 sets none; the forecast is five for each point."""
     steps: Number = 30_000

@@ -45,8 +45,8 @@ def poses(
     Args:
         data: Folder of the scene.
         order: "any" compares each photo with each. "video" compares it with those that follow by name.
-        lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
-            without distortion.
+        lens: COLMAP's camera model. OPENCV suits phones and cameras.
+            OPENCV_FISHEYE suits fisheyes, PINHOLE photos without distortion.
         several_lenses: The photos are of several lenses, or zoomed. Assumed where their sizes differ.
         seed: Seed of pycolmap's random choices.
 
@@ -65,9 +65,7 @@ def poses(
         several_lenses = True
         notes.append(f"Photos of {len(sizes)} sizes: assuming several lenses.")
     if order == "any" and len(names) > MANY:
-        notes.append(
-            f"Comparing {len(names)} photos with each other takes hours. For a video: --order video."
-        )
+        notes.append(f"Comparing {len(names)} photos with each other takes hours. For video: --order video.")
     for line in notes:
         print_plain(line, console)
     model = _model(data, Task(photos, names, data / WORK, lens, not several_lenses, order, seed), console)

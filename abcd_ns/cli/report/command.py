@@ -38,8 +38,8 @@ def report(
 
     Args:
         run: Folder of the run, outputs/SCENE/METHOD/TIME.
-        data: Folder of the run's photos, as given to `ns-train`. The path stored in the run is not followed:
-            a run from elsewhere could name any folder, and the page would show its content.
+        data: Folder of the run's photos, as given to `ns-train`. The path stored in the run is not followed.
+            A run from elsewhere could name any folder, and the page would show its content.
         out: File of the page. Default: report.html in the run's folder.
         pictures: Number of held-out views to show, from the best to the worst.
     """

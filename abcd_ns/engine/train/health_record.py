@@ -75,7 +75,7 @@ REPAIRED = {
     "moments": "moments that were no numbers set to zero",
     "values": "Gaussians that were no numbers replaced",
     "oversized": "oversized Gaussians shrunk",
-    "pruned": "Gaussians taken out that filled too little of their views",
+    "pruned": "Gaussians pruned that filled too little of their views",
 }
 """What the counts of a BlockHealth say."""
 

@@ -47,9 +47,9 @@ class Options:
     out: Annotated[str | None, words("PATH")] = None
     """Folder for the results; absent, empty, or one of an earlier comparison under the same protocol."""
     methods: Annotated[tuple[Method, ...] | None, words("METHOD ...")] = None
-    """Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact, abcd-paper
-    (needs steps), splatfacto, and splatfacto-scaled (needs steps): all its schedules, made for 30,000 steps,
-    reduced to as many. Where something else than methods has arms: abcd."""
+    """Default: abcd-monolithic, abcd, abcd-ablated; abcd alone where an arm is something else than a method.
+    Others: abcd-partition, abcd-exact, abcd-paper, splatfacto, splatfacto-scaled.
+    Give abcd-paper and splatfacto-scaled --steps. The latter scales schedules made for 30,000 steps."""
     seconds: Annotated[float | None, words("S")] = None
     """Budget of a run: seconds of training; evaluation, saving and compiling do not count."""
     steps: Annotated[int | None, words("N")] = None
@@ -61,8 +61,8 @@ class Options:
     blocks: Annotated[tuple[int, ...] | None, words("N ...")] = None
     """Blocks of every method that has any; an arm for each of several numbers. Default: 8."""
     vary: Annotated[tuple[str, ...] | None, words("NAME=VALUE ...")] = None
-    """An arm for each change of an option. Names: `ns-train abcd --help`, under --pipeline. Several
-    at once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
+    """An arm for each change of an option. Names: `ns-train abcd --help`, under --pipeline.
+    Several at once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
     tiles: Annotated[tuple[int, ...] | None, words("N ...")] = None
     """An arm for each size of a synthetic terrain, which takes the place of data: a block for each tile."""
     tile_gaussians: Annotated[int | None, words("N")] = None

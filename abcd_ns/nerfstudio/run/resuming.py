@@ -81,7 +81,7 @@ def has_begun(folder: Path) -> bool:
 
 
 def _view_only(path: Path, why: str) -> UserError:
-    return UserError(f"{path} can be viewed but not trained further: {why}.")
+    return UserError(f"{path} can be viewed but not trained further: {why}; begin a new run.")
 
 
 def _at_checkpoint(path: Path) -> Start:

@@ -134,8 +134,8 @@ def next_steps(trainer: Trainer, method: str, data: Path, checkpoints: Path) -> 
     }
     longer = command_to_resume(sys.argv, method, checkpoints, _doubled(trainer))
     if longer is not None:
-        why = f" {missed} of {blocks} blocks were not visited." if missed and state.visit else ""
-        steps[f"Train twice as long.{why}"] = longer
+        why = f", as {missed} of {blocks} blocks were not visited" if missed and state.visit else ""
+        steps[f"Train twice as long{why}:"] = longer
     return [line for what, command in steps.items() for line in (f"  {what}", f"    {command}")]
 
 
