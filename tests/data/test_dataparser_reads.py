@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,

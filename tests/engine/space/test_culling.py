@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.culling import BOUNDS_SLANT, ROUNDING, Frusta, Optics, bounds_of
 from abcd_ns.engine.space.partition import build_kd
@@ -132,3 +132,15 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
         assert torch.allclose(found.transmittance, expected.transmittance, atol=1e-12)
     assert len(scene.read) < 8
     assert int(tree.assign(torch.zeros(1, 3))[0]) in scene.read
+
+
+def test_few_parts_are_held_while_nodes_are_folded():
+    gaussians, (view,) = random_gaussians(128), ring_of_views(1)
+    scene, seen = MemoryScene(build_kd(gaussians.means, 32), gaussians), Seen(view, view.full)
+    renderer, parts, most = LayerRenderer(scene, DRAW, ownership="means", pass_gaussians=0), {}, 0
+    for node, shown in renderer.shown(renderer.nodes(0), [(view, view.full)], exclude=0).items():
+        (parts[node],) = renderer.render(node, renderer.load(shown), [seen], SETTINGS, 0)
+        renderer.fold_up(parts, node, seen)
+        most = max(most, len(parts))
+    assert list(parts) == [0]
+    assert most <= 6  # one for each level of a tree of 32, and the one that came last

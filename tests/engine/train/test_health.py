@@ -235,3 +235,13 @@ def test_a_visit_that_time_ran_out_on_says_nothing_of_whether_the_block_is_hidde
     assert coordinator.state.step == 0
     assert coordinator.state.health[block].visits == 1
     assert not coordinator.state.health[block].hidden
+
+
+def test_a_value_that_is_no_number_bounds_nothing(make, views, photos):
+    coordinator = make(blocks=1, steps=30, density=STILL)
+    train_step(coordinator, photos)
+    with torch.no_grad():
+        coordinator.params["means"][0] = coordinator.params["scales"][1] = math.nan
+    nobody = torch.zeros(len(coordinator.params["means"]), dtype=torch.bool)
+    largest = coordinator.health.largest(views, nobody)
+    assert bool((largest[:2] > 40).all())
