@@ -114,12 +114,10 @@ def read_scene(
         raise InputError(f"{found} names photos and masks itself: {fix}.")
     if found is not None:
         return read_transforms(found) if found == whole else read_split_transforms(data)
-    fault = (
-        "holds no model (such as sparse/0/cameras.bin or transforms.json)"
-        if data.exists()
-        else "does not exist"
+    found = (
+        "is a file" if data.is_file() else "holds no model (such as sparse/0/cameras.bin or transforms.json)"
     )
-    raise InputError(f"--data {data} {'is a file' if data.is_file() else fault}; {_advice(data)}.")
+    raise InputError(f"--data {data} {found if data.exists() else 'does not exist'}; {_advice(data)}.")
 
 
 def _advice(data: Path) -> str:

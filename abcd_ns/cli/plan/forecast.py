@@ -87,10 +87,8 @@ class Forecast:
             return None
         if not fit.limit:
             return f"limited to {fit.sole:,} Gaussians: there is no room for the layers of several blocks"
-        lost = next(
-            (f"up to {lost} dB" for least, lost in LOST.items() if share >= least),
-            f"over {max(LOST.values())} dB",
-        )
+        most = min((lost for least, lost in LOST.items() if share >= least), default=None)
+        lost = f"up to {most} dB" if most else f"over {max(LOST.values())} dB"
         return f"{lost} below one block with {1 / share:.1f} times this memory"
 
     @property

@@ -91,9 +91,7 @@ def _window(rasterizer: Rasterizer, crop: Crop, device: torch.device) -> ZWindow
 def _loss(raster: Raster) -> Float[Tensor, ""]:
     """Depends on every output of every pixel, differently."""
     planes = torch.cat((raster.color, raster.transmittance[..., None], 0.2 * raster.depth[..., None]), dim=-1)
-    weights = torch.cos(torch.arange(planes.numel(), device=planes.device, dtype=planes.dtype)).view_as(
-        planes
-    )
+    weights = torch.arange(planes.numel()).to(planes).cos().view_as(planes)
     return (planes * weights).sum()
 
 

@@ -73,8 +73,8 @@ class Options:
     """An arm for each share, such as 1/4, of the memory that abcd-monolithic takes for Gaussians.
     Each method of ABCD's keeps to it. abcd-monolithic and splatfacto also run without a limit."""
     hold_out: HoldOut | None = None
-    """Which views are not trained on. auto, the default: those that the data list, without lists every 8th by
-    name. interval: every 8th. sector: an eighth from one place."""
+    """Which views are not trained on. Default: auto, those that the data list.
+    Without lists every 8th by name, as with interval. With sector an eighth from one place."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
     pictures: Annotated[int | None, words("N")] = None
