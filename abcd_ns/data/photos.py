@@ -226,7 +226,7 @@ def _read_mask(source: PhotoSource) -> Tensor:
     mask = _decode(source.mask_path, visible)[..., None]
     width, height = source.reduced
     if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
-        shape = f"{mask.shape[1]} x {mask.shape[0]}"
+        shape = f"{mask.shape[1]} x {mask.shape[0]} px"
         raise InputError(f"{source.mask_path}: {shape}, unlike its photo ({width} x {height}); replace it.")
     used = area_reduce(mask * np.uint8(_MASK_USED), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)

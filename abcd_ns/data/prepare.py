@@ -187,8 +187,9 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     masked = sum(source.mask_path is not None for source in sources)
     if 0 < masked < len(sources):
         more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
-    notes, chosen = (*scene.notes, *notes, *more), wanted is None and not options.max_side and factor > 1
+    chosen = wanted is None and not options.max_side and factor > 1
     reduced = (_reduction(scene, sources, factor),) if chosen and needs_photos else ()
+    notes = (*scene.notes, *notes, *more)
     return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, reduced)
 
 

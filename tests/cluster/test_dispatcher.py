@@ -67,7 +67,7 @@ class Unreliable:
     "options", [{"density": GROWING}, {"density": STILL, "coarse_model": 40, "warmup": 0.3}]
 )
 def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos, options):
-    alone, assigned = make("alone", **options), make("lent", workers=1, lag=1, **options)
+    alone, assigned = make("alone", **options), make("assigned", workers=1, lag=1, **options)
     train(alone, photos)
     train(assigned, photos)
     assert isinstance(assigned, Dispatcher)
@@ -81,7 +81,7 @@ def test_workers_keep_to_the_room_that_harmonics_leave(make, photos, monkeypatch
     monkeypatch.setattr(control, "MOST_NEW", 1.0)
     density = replace(GROWING, refine_stop=0.2, min_contribution=0.0)
     options = {"density": density, "late_harmonics": 2, "block_limit": 30}
-    alone, assigned = make("alone", **options), make("lent", workers=1, lag=1, **options)
+    alone, assigned = make("alone", **options), make("assigned", workers=1, lag=1, **options)
     for run in (alone, assigned):
         train(run, photos)
         assert run.state.sh_degree == 1

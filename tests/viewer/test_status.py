@@ -7,6 +7,7 @@ import pytest
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.types import Crop
@@ -59,7 +60,7 @@ def test_of_many_blocks_the_table_shows_the_urgent_ones():
 
 
 def a_run(step: int, progress: float, min_contribution: float = 8.0):
-    density = SimpleNamespace(min_contribution=min_contribution, strategy="error")
+    density = DensityConfig(min_contribution=min_contribution)
     return SimpleNamespace(
         config=SimpleNamespace(density=density, recipe=SimpleNamespace(exact=False)),
         state=SimpleNamespace(step=step),

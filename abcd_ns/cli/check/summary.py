@@ -79,4 +79,4 @@ def _counted(photos: dict[str, int], unit: str = "") -> str:
 
 
 def _box(sides: list[float]) -> str:
-    return " x ".join(f"{float(f'{side:.3g}'):,g}" for side in sides)
+    return " x ".join(f"{float(f'{side:.3g}'):,.12g}" for side in sides)

@@ -87,9 +87,9 @@ class Forecast:
             return None
         if not fit.limit:
             return f"limited to {fit.sole:,} Gaussians: there is no room for the layers of several blocks"
-        most = min((lost for least, lost in LOST.items() if share >= least), default=None)
-        lost = f"up to {most} dB" if most else f"over {max(LOST.values())} dB"
-        return f"{lost} below one block with {1 / share:.1f} times this memory"
+        lost = min((lost for least, lost in LOST.items() if share >= least), default=None)
+        found = f"up to {lost} dB in four small scenes, below" if lost else "not measured, below that of"
+        return f"{found} one block with {1 / share:.1f} times this memory"
 
     @property
     def warnings(self) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.events import EpochEnded, PrunedAtEnd, VisitBegan, WorkerLost
 
-SCHEMA = 1
+SCHEMA = 2
 """Raised whenever a line changes its form or meaning."""
 
 

@@ -15,6 +15,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.run import log_lines
 from abcd_ns.nerfstudio.run.log_lines import KINDS
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings, flat_options
@@ -22,7 +23,7 @@ from abcd_ns.run import STATE
 from tests.lab.compare.records import MACHINE, VERSIONS
 
 TRAINING = {
-    "schema": 1,
+    "schema": log_lines.SCHEMA,
     "blocks": 3,
     "gaussians": 300,
     "limit": 1000,

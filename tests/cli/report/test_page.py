@@ -124,10 +124,10 @@ def test_the_page_needs_nothing_else_and_runs_its_own_script_alone(shown):
 
 def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_any(tmp_path):
     run = made_up_run(tmp_path)
-    shed = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
+    pruned = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
     ends = [{"worker": 0, "deaths": 1, "waited": 0.25}, {"worker": 1, "deaths": 0, "waited": 0.05}]
     lines = [line("worker", 40, 16.0, visits=2, **end) for end in ends]
-    found = with_lines(run, *lines, line("pruned at end", 40, 17.0, **shed))
+    found = with_lines(run, *lines, line("pruned at end", 40, 17.0, **pruned))
     assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
     figures = more_figures(found, None)
     assert figures["workers"] == "2, waited 15% of the time, 1 lost"

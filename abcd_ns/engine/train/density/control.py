@@ -81,6 +81,11 @@ class DensityConfig:
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
 
     @property
+    def prunes_at_end(self) -> bool:
+        """Whether a final pruning follows the run."""
+        return self.min_contribution > 0 and self.strategy != "off"
+
+    @property
     def limit(self) -> int | None:
         """Gaussians in the whole scene at most, or None."""
         if self.max_gaussians > 0:

@@ -92,8 +92,7 @@ class FinalPruning:
     @property
     def is_wanted(self) -> bool:
         """Whether the run's options let Gaussians go."""
-        density = self._run.density.config
-        return density.min_contribution > 0 and density.strategy != "off"
+        return self._run.density.config.prunes_at_end
 
     def run(self) -> None:
         """Do it; tells listeners how many went, and at what cost."""
