@@ -81,3 +81,14 @@ def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_
     assert not control.is_due(clock(steps=132, **late))
     assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
     assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))
+
+
+def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
+    late = {"progress": 0.6, "refined": 0, "spent": 0.1}
+    control = DensityControl(DensityConfig())
+    assert control.is_due(clock(first=True, **late))
+    assert not control.is_due(clock(first=True, **{**late, "progress": 0.71}))
+    assert not control.is_due(clock(**late))
+    assert not control.is_due(clock(first=True, **{**late, "spent": 0.6}))
+    never = DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0))
+    assert not never.is_due(clock(first=True, **late))

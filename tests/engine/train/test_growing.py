@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.train.density.growing import split_gaussians
+from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -106,3 +106,9 @@ def test_the_opaque_stay_opaque():
     assert bool(after.opacities.isfinite().all())
     assert bool((shown[:2] > 0.99).all())
     assert float(shown[2]) == pytest.approx(1 - 0.5 ** (1 / 1.2))
+
+
+@pytest.mark.parametrize(("room", "expected"), [(9, [1, 2, 3, 4]), (2, [2, 4]), (1, [4]), (0, []), (-3, [])])
+def test_those_grow_that_want_to_most(room, expected):
+    wanted = torch.tensor([0.0, 1.0, 3.0, 2.0, torch.inf, 0.0])
+    assert chosen(wanted, room).nonzero().flatten().tolist() == expected

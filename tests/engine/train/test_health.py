@@ -8,7 +8,7 @@ import torch
 
 from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
-from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
@@ -245,3 +245,16 @@ def test_a_value_that_is_no_number_bounds_nothing(make, views, photos):
     nobody = torch.zeros(len(coordinator.params["means"]), dtype=torch.bool)
     largest = coordinator.health.largest(views, nobody)
     assert bool((largest[:2] > 40).all())
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(3, 3), (3000, 40)])
+def test_blocks_are_refined_once_a_visit_however_many_views_there_are(make, photos, seen, expected):
+    coordinator = make(blocks=2, steps=200, visit_steps=10)
+    train_step(coordinator, photos)
+    coordinator.state.active.showing = tuple(range(seen))
+    clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
+    assert (clock.views, min(clock.views, clock.visit)) == (seen, expected)
+    control = DensityControl(DensityConfig(refine_every=1))
+    due = replace(clock, progress=0.02, refined=0, first=False)
+    assert control.is_due(replace(due, steps=expected))
+    assert not control.is_due(replace(due, steps=expected - 1))

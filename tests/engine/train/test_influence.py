@@ -154,3 +154,12 @@ def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
     assert run.visits.begin(at_once=2).geometry.block == queued[-1]
     run.state.in_flight.clear()
     assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the epoch's order
+
+
+def test_a_block_looks_at_a_doubtful_view_that_sees_it(grown, monkeypatch):
+    coordinator = grown()
+    asked_of(coordinator, monkeypatch, blind=(1, 2, 4))
+    coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
+    active = coordinator.visits.begin()
+    assert active.views == (0, 3)
+    assert active.looked_at == (3,)
