@@ -32,6 +32,7 @@ class AbcdDataset(InputDataset):
 
     Args:
         dataparser_outputs: of AbcdDataParser or any of nerfstudio's.
+        scale_factor: 1; splatfacto's datamanager passes it.
         budget_bytes: see Photos.
         needs_photos: see `with_photos`.
     """
@@ -39,11 +40,12 @@ class AbcdDataset(InputDataset):
     def __init__(
         self,
         dataparser_outputs: DataparserOutputs,
+        scale_factor: float = 1.0,
         budget_bytes: int | None = None,
         needs_photos: bool = True,
     ):
         outputs = with_photos(dataparser_outputs, needs_photos)
-        super().__init__(outputs)
+        super().__init__(outputs, scale_factor)
         self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:

@@ -20,13 +20,13 @@ STEPS = 20
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    """(results, plan, what was printed) of two methods, really trained, the first in a process of its own."""
+    """(results, plan, what was printed) of methods, really trained, the first in a process of its own."""
     folder = tmp_path_factory.mktemp("compare")
     write_scene(folder / "scene")
     options = Options(
         data=str(folder / "scene"),
         out=str(folder / "out"),
-        methods=("abcd-monolithic", "abcd"),
+        methods=("abcd-monolithic", "abcd", "splatfacto-scaled"),
         steps=STEPS,
         blocks=(2,),
         evals=3,
@@ -43,7 +43,7 @@ def compared(tmp_path_factory):
 @pytest.mark.cli
 def test_a_scene_is_as_large_as_its_export(compared, tmp_path):
     results, plan, _ = compared
-    for run in results.runs:
+    for run in results.runs[:2]:
         for suffix, size in {".ply": run.ply_bytes, ".spz": run.spz_bytes}.items():
             out = tmp_path / f"{run.method}{suffix}"
             export(plan.out / "runs" / run.method / "seed-0", out=out, frame="nerfstudio")
@@ -53,7 +53,7 @@ def test_a_scene_is_as_large_as_its_export(compared, tmp_path):
 @pytest.mark.cli
 def test_runs_report_what_was_asked_for(compared):
     results, _, printed = compared
-    assert [run.method for run in results.runs] == ["abcd-monolithic", "abcd"]
+    assert [run.method for run in results.runs] == ["abcd-monolithic", "abcd", "splatfacto-scaled"]
     for run in results.runs:
         assert run.steps == STEPS
         assert len(run.views) == HELD_OUT
@@ -63,9 +63,10 @@ def test_runs_report_what_was_asked_for(compared):
         assert run.gaussians > 0
         assert 0 < run.train_seconds < run.total_seconds
         assert run.peak_rss_bytes > 100 << 20
-        assert run.store_bytes > 0
         assert run.method in printed
-    single, blocks = results.runs
+    single, blocks, peer = results.runs
+    assert peer.blocks == 1
+    assert min(single.store_bytes, blocks.store_bytes) > 0
     assert (single.blocks, blocks.blocks) == (1, 2)
     assert single.ordering_gap_note
     assert single.layer_seconds < blocks.layer_seconds < blocks.train_seconds
@@ -76,7 +77,7 @@ def test_runs_report_what_was_asked_for(compared):
 
 
 @pytest.mark.cli
-def test_curves_rise_in_time_to_the_final_score_as_in_the_runs_log(compared):
+def test_curves_rise_in_time_to_the_final_score_as_in_logs_of_abcd(compared):
     results, plan, _ = compared
     for job, run in zip(plan.jobs, results.runs, strict=True):
         seconds = [point.seconds for point in run.curve]
@@ -85,6 +86,8 @@ def test_curves_rise_in_time_to_the_final_score_as_in_the_runs_log(compared):
         assert all(point.gaussians > 0 for point in run.curve)
         end = CurvePoint(run.train_seconds, STEPS, run.psnr_merged, run.gaussians)
         assert run.curve[-1] == end
+        if run.method == "splatfacto-scaled":
+            continue
         lines = map(json.loads, (job.folder(plan.out) / "abcd" / "log.jsonl").read_text().splitlines())
         scores = [line["psnr"] for line in lines if line["kind"] == "held out"]
         assert scores == [point.psnr for point in run.curve[:-1]]
