@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -104,10 +105,10 @@ def check_tool(words: Sequence[str]) -> None:
     folders = [Path(out).parent] if out else []
     folders += [Path(given) for flag in FOLDERS if (given := _value(words, flag))]
     for folder in folders:  # the tools fail by a traceback, ns-eval at its end
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{folder} cannot be made ({error.strerror}): choose another folder.") from None
+        there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK):
+            why = "is read-only" if there.is_dir() else "is a file"
+            raise UserError(f"{folder} cannot be made, {there} {why}: choose another folder.")
     if (path := _value(words, "--camera-path-filename")) is not None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))

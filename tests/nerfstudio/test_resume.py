@@ -316,20 +316,22 @@ def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
         mine.check(store)  # nothing was written down
 
 
-@pytest.mark.parametrize("what", ["nothing", "checkpoint alone", "not begun"])
+@pytest.mark.parametrize("what", ["nothing", "checkpoint alone", "another method's", "not begun"])
 def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
     models = tmp_path / "run" / "nerfstudio_models"
     models.mkdir(parents=True)
-    if what == "checkpoint alone":
+    if what in ("checkpoint alone", "another method's"):
         (models / "step-000000010.ckpt").write_bytes(b"")
     if what == "not begun":
         ParameterStore.create(tmp_path / "run" / "abcd" / "store", {}).close()
     expected = {
         "nothing": "There is no run of ABCD",
         "checkpoint alone": "can be viewed but not trained further",
+        "another method's": f"{models.parent} can be viewed but not trained further",
         "not begun": "ended before it began: start it anew",
     }
-    assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=models), capsys)
+    asked = models.parent if what == "another method's" else models
+    assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=asked), capsys)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def find_start(config: TrainerConfig) -> Start | None:
         if config.load_step is not None:
             raise UserError(f"--load-step {config.load_step} does not say of which run: add --load-dir.")
         return None
-    within = (config.load_dir / STATE).is_dir()
+    within = any((config.load_dir / name).is_dir() for name in (STATE, config.relative_model_dir))
     run = config.load_dir if within else config.load_dir.absolute().parent
     if config.load_step is not None:
         return _at_checkpoint(run / config.relative_model_dir / f"{pin_name(config.load_step)}.ckpt")
