@@ -12,11 +12,12 @@ from abcd_ns.engine.events import Repaired
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, nothing_live
 from abcd_ns.engine.render import Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen
+from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen, veils
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
 from tests.reference.scenes import listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
@@ -123,6 +124,38 @@ def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_prunes(make, 
     left = whole_scene(coordinator)
     assert len(left) == 40
     assert float(torch.sigmoid(left.opacities).min()) >= 1 / 255
+
+
+def before_a_camera(view: View, count: int) -> Gaussians:
+    """So many, wide and opaque, a twentieth before the view's camera."""
+    found = random_gaussians(count, seed=3, size=0.05)
+    spot = view.center + 0.05 * view.viewmat[2, :3]
+    return replace(found, means=spot.expand(count, 3).clone(), opacities=torch.full((count, 1), 2.0))
+
+
+def test_what_veils_a_view_is_what_its_near_plane_hides(start, views):
+    views = [replace(view, near=0.2) for view in views]
+    scene, rasterizer = Gaussians.cat([start, before_a_camera(views[1], 2)]), TorchRasterizer()
+    whole = Shot(replace(views[1], near=NEAR_PLANE), views[1].full)
+    (expected,) = weights(scene, rasterizer, [whole])
+    found = veils(scene, views, rasterizer, antialiased=False)
+    assert float(found[-2:].sum()) > 0.5 * whole.crop.pixels
+    torch.testing.assert_close(found[-2:], expected[-2:])
+    assert bool((found[:-2] == 0).all())
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, views, photos, blocks):
+    """It fills a little of the other views, as a floater that they see from afar."""
+    near = [replace(view, near=0.2) for view in views]
+    start = Gaussians.cat([random_gaussians(120, seed=1, size=0.12), before_a_camera(near[0], 1)])
+    density = replace(STILL, min_contribution=1e-6)
+    coordinator = make(start=start, views=near, blocks=blocks, steps=60, density=density, batch=1)
+    train(coordinator, photos)
+    scene, rasterizer = whole_scene(coordinator), coordinator.run.rasterizer
+    assert len(scene) >= 100
+    assert float((scene.means - near[0].center).norm(dim=1).min()) > 0.2
+    assert float(veils(scene, near, rasterizer, antialiased=False).sum()) < 0.01 * near[0].full.pixels
 
 
 @pytest.mark.parametrize(("progress", "gone"), [(0.6, [0, 1]), (0.25, [0]), (0.8, [])])

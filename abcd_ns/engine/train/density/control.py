@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from gsplat.strategy import MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
@@ -229,9 +230,13 @@ class DensityControl:
         optimizers: Optimizers,
         growth: dict[str, Tensor],
         progress: float,
+        veils: Float[Tensor, "n"] | float = 0.0,
     ) -> dict[str, Tensor]:
         """Take out what fills too little of the block's views, at a share of the run; floaters; and what is
         too faint for any picture to show, which nothing would train again.
+
+        Args:
+            veils: see `pruning.veils`; what veils more than it contributes goes.
 
         Returns:
             The block's statistics from now on.
@@ -241,7 +246,9 @@ class DensityControl:
         bounds = self.config.min_contribution, FAINT
         least, faint = (risen(bound, progress, self.config.refine_stop) for bound in bounds)
         opacities = torch.sigmoid(params["opacities"][:, 0])
-        drop = (contributions(growth) <= least) | (opacities < MIN_ALPHA) | floaters(growth, opacities, faint)
+        found = contributions(growth)
+        drop = (found <= least) | (found < veils) | (opacities < MIN_ALPHA)
+        drop |= floaters(growth, opacities, faint)
         growth = dict(growth)  # rows are taken out of it
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)

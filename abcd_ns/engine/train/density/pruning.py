@@ -8,7 +8,8 @@ sum of such weights when training ends. Here they go while it goes on, at a mini
 to its end: those that remain take their place, and each step costs less.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,7 +17,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from abcd_ns.engine.render import Raster
+from abcd_ns.engine.render import Raster, Rasterizer, Shot
+from abcd_ns.engine.space.influence import weights
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
 
 BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
@@ -113,6 +116,22 @@ def floaters(
     """
     full = contributions(growth)
     return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
+
+
+def veils(
+    gaussians: Gaussians, views: Iterable[View], rasterizer: Rasterizer, antialiased: bool
+) -> Float[Tensor, "n"]:
+    """Pixels that each Gaussian would fill of all views from before their near planes. A run draws nothing
+    there; other viewers, which get only a file, do."""
+    found = gaussians.means.new_zeros(len(gaussians))
+    for view in views:
+        matrix = view.viewmat.to(gaussians.means)
+        z = gaussians.means @ matrix[2, :3] + matrix[2, 3]
+        (near,) = torch.where((z > NEAR_PLANE) & (z < view.near))
+        if len(near):  # nothing else is before them
+            shot = Shot(replace(view, near=NEAR_PLANE), view.full)
+            found[near] += weights(gaussians[near], rasterizer, [shot], antialiased=antialiased)[0]
+    return found
 
 
 def risen(bound: float, progress: float, growth_ends: float) -> float:

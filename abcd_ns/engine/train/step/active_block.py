@@ -9,12 +9,12 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, detach, raise_degree
+from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, raise_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
-from abcd_ns.engine.train.density.pruning import contributions, faded, have_contributions
+from abcd_ns.engine.train.density.pruning import contributions, faded, have_contributions, veils
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
@@ -151,8 +151,11 @@ class ActiveBlock:
     def prune(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
         change too little. What is seen from now on soon counts for more."""
-        run, before = self._run, len(self)
-        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share)
+        run, before, found = self._run, len(self), 0.0
+        if run.density.wants_weights and run.share >= run.config.density.refine_stop:
+            live = live_gaussians(run.params).detach()
+            found = veils(live, run.views.values(), run.rasterizer, run.config.antialiased)
+        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()
         self.growth = faded(self.growth)

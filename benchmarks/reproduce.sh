@@ -1,0 +1,68 @@
+#!/usr/bin/env bash
+# Trains what docs/results/README.md claims of scenes, one core a run.
+#
+#   DATA=FOLDER benchmarks/reproduce.sh            lists the rows and how long they take
+#   DATA=FOLDER benchmarks/reproduce.sh NAME ...   takes those whose names begin so; `all` takes all
+#
+# FOLDER has the scenes. Needs a clean commit and an idle core. Stopped, the same command goes on. In the
+# end the results are in docs/results, its tables are made anew, and a test compares numbers in texts.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+export PATH="$PWD/.venv/bin:$PATH" OMP_NUM_THREADS=1
+small="castle-P30 fox caliterra bonsai"
+two_seeds="--seeds 0 1"
+
+rows() { # by the name, minutes, scene, reduction, then options of `abcd compare`
+    local row=$1 scene
+    for scene in $small; do
+        $row splatfacto/$scene 25 $scene 4 --steps 4000 --methods abcd-monolithic splatfacto-scaled $two_seeds
+    done
+    $row splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
+    for scene in $small; do
+        $row budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
+    done
+    $row budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
+    $row budgets/fox-640 50 fox 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
+    for scene in castle-P30 fox caliterra; do
+        $row equal-time/$scene 6 $scene 4 --seconds 60 --methods abcd-monolithic abcd --blocks 8 $two_seeds
+    done
+    $row equal-time/bonsai-320 13 bonsai 2 --seconds 300 --methods abcd-monolithic abcd --blocks 8
+    $row equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
+    for scene in castle-P30 fox bonsai; do
+        $row blocks/$scene 12 $scene 4 --seconds 180 --methods abcd --blocks 1 8 32
+    done
+    $row peers/castle-P30 13 castle-P30 4 --seconds 120 --blocks 8 \
+        --methods abcd-monolithic abcd abcd-exact abcd-partition abcd-ablated
+}
+
+list() {
+    printf '%-26s %3d min   abcd compare --data %s --downscale %s %s\n' "$1" "$2" "$3" "$4" "${*:5}"
+}
+
+take() {
+    local name=$1 scene=$3 reduction=$4 wanted
+    for wanted in $asked; do
+        [[ $wanted == all || $name == "$wanted"* ]] || continue
+        abcd compare --data "$DATA/$scene" --downscale "$reduction" "${@:5}" --pictures 0 --out "$out/$name"
+    done
+}
+
+collect() {
+    local found=$out/$1/results.json
+    [[ ! -f $found ]] || install -D -m 644 "$found" "docs/results/$1.json"
+}
+
+if (($# == 0)); then
+    rows list
+    exit
+fi
+: "${DATA:?is the folder with the scenes: DATA=FOLDER $0 $*}"
+if [[ -n $(git status --porcelain) ]]; then
+    echo "Files differ from the commit, so nobody could do it again: commit them, or put them away." >&2
+    exit 2
+fi
+asked=$* out=outputs/reproduced/$(git rev-parse --short HEAD)
+rows take
+rows collect
+python -m benchmarks.tables
+python -m pytest -q tests/test_documents.py
