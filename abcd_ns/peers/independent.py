@@ -41,7 +41,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, VisitKind
-from abcd_ns.engine.train.schedule import plan_epoch
+from abcd_ns.engine.train.schedule import evenly, plan_epoch
 from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -218,10 +218,13 @@ class BlocksAlone(Visits):
         return enlarged(self._scene.tree.cell(block), means, self._run.config.recipe.overlap)
 
     def _joined(self, block: int) -> BlockState:
-        """The block as it begins, with what of the others lies in its enlarged cell."""
+        """The block as it begins: its own, and as many of the others in its enlarged cell as have room."""
         box, others = self._box(block), [b for b in self._blocks if b != block]
         own, *around = [self._scene.stored(initial_of(b)) for b in [block, *others]]
-        return join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
+        joined = join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
+        room = (self._run.config.limits.sole_limit or len(joined)) - len(own)
+        more = evenly(range(len(own), len(joined)), max(room, 0))
+        return joined[torch.tensor([*range(len(own)), *more])]
 
 
 def independent_trainer(run: TrainingRun) -> Coordinator:

@@ -125,8 +125,6 @@ def wrong_words() -> list[tuple[str, str]]:
         ("train absent.toml", "absent.toml does not exist"),
         ("train run", "run cannot be read as TOML"),
         ("demo --out photo.jpg", "photo.jpg is a file"),
-        ("doctor --json absent/doctor.json", "the folder absent does not exist"),
-        ("check --data absent --json absent/check.json", "the folder absent does not exist"),
     ]
 
 

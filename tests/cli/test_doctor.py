@@ -1,6 +1,5 @@
 """`abcd doctor`: every ailment is found by what it leaves in the facts, and nothing is built or written."""
 
-import json
 import os
 import subprocess
 import sys
@@ -72,7 +71,7 @@ def test_a_healthy_machine_has_no_warnings_and_so_many_workers(capsys, monkeypat
     assert doctor() == 0
     shown = capsys.readouterr().out
     assert f"\nworkers         {workers}" in shown
-    assert {finding.name for finding in diagnose(found).findings} <= {"no-gpu"}
+    assert {finding.name for finding in diagnose(found)} <= {"no-gpu"}
 
 
 @pytest.mark.parametrize(
@@ -100,7 +99,7 @@ def test_a_healthy_machine_has_no_warnings_and_so_many_workers(capsys, monkeypat
     ],
 )
 def test_each_ailment_is_found_with_its_cure(found, level, name, said):
-    wanted = [finding for finding in diagnose(found).findings if finding.name == name]
+    wanted = [finding for finding in diagnose(found) if finding.name == name]
     assert [finding.level for finding in wanted] == [level]
     assert said in wanted[0].what + wanted[0].fix
 
@@ -119,17 +118,15 @@ def test_where_all_is_well_the_screen_is_short_and_notes_wait_to_be_asked_for(ca
         assert said in full
 
 
-def test_the_report_names_no_home(tmp_path, monkeypatch, capsys):
+def test_the_report_names_no_home(monkeypatch, capsys):
     home = str(Path.home())
     found = but(broken={"cv2": f"no {home}/lib.so"}, folder=f"{home}/.cache/x")
     monkeypatch.setattr(command, "gather", lambda: found)
-    doctor(json=tmp_path / "report.json", verbose=True)
-    text = (tmp_path / "report.json").read_text()
-    for said in (text, capsys.readouterr().out):
-        assert home + "/" not in said
-        assert "~/.cache/x" in said
-        assert "~/lib.so" in said
-    assert json.loads(text)["facts"]["build_tools"]["nvcc"] == "13.0"
+    doctor(verbose=True)
+    said = capsys.readouterr().out
+    assert home + "/" not in said
+    assert "~/.cache/x" in said
+    assert "~/lib.so" in said
 
 
 # Looking

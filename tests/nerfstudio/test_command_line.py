@@ -97,7 +97,7 @@ REFUSED = {
     "ns-export marching-cubes": "abcd mesh",
     "ns-render spiral": "ns-render interpolate",
     "ns-eval --output-path scores.txt": "scores.txt must end in .json",
-    "ns-eval --output-path broken.json/new/scores.json": "broken.json/new cannot be made, .*broken.json is a file",
+    "ns-eval --output-path broken.json/new/scores.json": "new cannot be made, .*broken.json is a file",
     "ns-eval --output-path out/x.json --render-output-path broken.json": "broken.json cannot be made",
     "ns-export gaussian-splat --output-dir broken.json": "broken.json cannot be made",
     "ns-render camera-path --camera-path-filename none.json": "none.json is no camera path",

@@ -146,3 +146,13 @@ def test_a_limit_on_gaussians_is_shared_out(independent, photos, start):
     for event in began:
         assert most[event.block] <= max(limit * event.gaussians / len(start), event.gaussians)
     assert any(most[event.block] > event.gaussians for event in began)
+
+
+def test_a_block_keeps_to_what_a_device_holds_though_its_overlap_is_more(independent, photos):
+    coordinator = independent(steps=40, density=GROWING, batch=1, sole_limit=35)
+    assert max(len(coordinator.scene.gaussians(b)) for b in range(4)) < 35
+    began = listen(coordinator, VisitBegan)
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        assert len(coordinator.params["means"]) <= 35
+    assert any(event.gaussians == 35 for event in began)

@@ -1,22 +1,16 @@
 """`abcd doctor`: what this machine and environment are, whether they can train, and what to do where not."""
 
-import json as json_text
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
 
 from rich.console import Console
 
 from abcd_ns.cli.doctor.facts import Facts, gather
 from abcd_ns.cli.doctor.rules import findings_of
 from abcd_ns.cli.findings import Finding, by_level, print_findings
-from abcd_ns.cli.paths import check_file
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.lab.results.records import decode, encode, write_json
 from abcd_ns.machine import without_home
 from abcd_ns.units import bytes_in_words
 
-SCHEMA = 3
-"""Of the JSON file; changes with its fields."""
 CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
@@ -25,51 +19,36 @@ DETAILS = ("os", "driver", "torch_cuda", "lpips_missing")
 """Facts that only --verbose shows, beside the other packages' versions."""
 
 
-@dataclass(frozen=True)
-class Report:
-    """All that `abcd doctor` says. The user's home folder is written as ~."""
-
-    schema: int
-    facts: Facts
-    findings: tuple[Finding, ...]
-    """The most serious first."""
-
-
-def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
+def doctor(*, verbose: bool = False) -> int:
     """Examine this machine: versions, hardware, compiled kernels. Say what to fix.
 
-    Compiles nothing and writes nothing unless --json is given. The output names no user and no home folder,
-    so that it can be copied into an issue. The exit code is 1 if training cannot work.
+    Compiles nothing and writes nothing. The output names no user and no home folder, so that it can be copied
+    into an issue. The exit code is 1 if training cannot work.
 
     Args:
-        json: Also write everything that was found into this file.
         verbose: Show all versions and notes.
     """
-    if json is not None:
-        check_file("--json", json)
-    report = diagnose(gather())
-    facts, console = report.facts, Console()
+    facts, console = gather(), Console()
+    findings = diagnose(facts)
     details = facts.versions | facts.build_tools | {name: getattr(facts, name) for name in DETAILS}
     more = {name.replace("_", " "): value or "none" for name, value in details.items() if verbose}
-    print_facts(_rows(facts) | more, console)
-    shown = [finding for finding in report.findings if verbose or finding.level != "note"]
+    print_facts({name: without_home(value) for name, value in (_rows(facts) | more).items()}, console)
+    shown = [finding for finding in findings if verbose or finding.level != "note"]
     print_findings(shown, console)
-    ill = any(finding.level == "error" for finding in report.findings)
+    ill = any(finding.level == "error" for finding in findings)
     verdict = "Training cannot work here yet: fix the errors." if ill else "Training can work here."
     if not verbose:
-        left = len(report.findings) - len(shown)
+        left = len(findings) - len(shown)
         notes = f" and {many(left, 'note', 'notes')}" if left else ""
         verdict += f" All versions{notes}: abcd doctor --verbose"
     console.print(f"\n{verdict}", highlight=False)
-    if json is not None:
-        write_json(json, encode(report))
     return CANNOT_TRAIN if ill else 0
 
 
-def diagnose(facts: Facts) -> Report:
-    """What follows from the facts."""
-    report = Report(SCHEMA, facts, by_level(findings_of(facts)))
-    return decode(Report, json_text.loads(without_home(json_text.dumps(encode(report)))), "the report")
+def diagnose(facts: Facts) -> tuple[Finding, ...]:
+    """What follows from the facts, the most serious first."""
+    found = findings_of(facts)
+    return by_level(replace(f, what=without_home(f.what), fix=without_home(f.fix)) for f in found)
 
 
 def _rows(f: Facts) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """`abcd check`: refuses what training refuses, in its words, and explains what is doubtful."""
 
-import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -32,15 +31,14 @@ def depths_in_training(found: Survey) -> Iterator[float]:
         yield from -z[(z < 0) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)]
 
 
-def test_a_sound_scene_is_summed_up(sound, found, tmp_path, capsys):
+def test_a_sound_scene_is_summed_up(sound, found, capsys):
     before = sorted(sound.rglob("*"))
-    assert check(data=sound, json=tmp_path / "report.json") == 0
+    assert check(data=sound) == 0
     assert sorted(sound.rglob("*")) == before
 
     printed = capsys.readouterr().out
-    report = json.loads((tmp_path / "report.json").read_text())
-    summary = report["summary"]
-    assert report["findings"] == []
+    summary, findings = examine(sound)
+    assert findings == ()
     assert summary["photos"] == len(NAMES)
     assert summary["sizes"] == {f"{w} x {h}": 5 for w, h in SIZES}
     assert (summary["train"], summary["held_out"], summary["points"]) == (8, 2, POINTS)
@@ -85,10 +83,9 @@ def test_what_training_refuses_is_refused_in_the_same_lines(scene, tmp_path, cap
     printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert [line for line in printed if "input: " in line] == [f"input: {e}" for e in refused.value.lines]
     assert sorted(tmp_path.rglob("*")) == before
-    assert check(data=scene, json=tmp_path / "report.json") == 2
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["summary"] is None
-    assert {finding["level"] for finding in report["findings"]} == {"error"}
+    summary, findings = examine(scene)
+    assert summary is None
+    assert {finding.level for finding in findings} == {"error"}
 
 
 def test_damage_in_the_middle_of_a_photo_is_an_error(scene, capsys):
@@ -119,6 +116,6 @@ def test_the_readers_notes_are_warnings(tmp_path):
     write_photos(tmp_path / "images")
     for i in range(11):
         Image.new("RGB", (9, 9), (i, 90, 90)).save(tmp_path / f"images/extra{i}.png")
-    said = [finding.what for finding in examine(tmp_path).findings if finding.name == "input"]
+    said = [finding.what for finding in examine(tmp_path)[1] if finding.name == "input"]
     assert any("has no points" in line for line in said)
     assert any("Fewer than half have one" in line for line in said)

@@ -20,7 +20,7 @@ from tests.data.dataparser_scenes import NAMES, SIZES, write_model, write_photos
 def test_few_photos_and_a_split_that_leaves_one(tmp_path):
     write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2], params=wide)
     write_photos(tmp_path / "images", names=NAMES[:2])
-    (few,) = (finding for finding in examine(tmp_path).findings if finding.name == "few-photos")
+    (few,) = (finding for finding in examine(tmp_path)[1] if finding.name == "few-photos")
     assert "2 photos, 1 of them to train on" in few.what
     assert "eval-mode all" in few.fix
 
