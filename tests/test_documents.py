@@ -4,6 +4,7 @@ import functools
 import json
 import re
 import shlex
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from nerfstudio.scripts.viewer.run_viewer import RunViewer
 from abcd_ns.cli import main as cli
 from abcd_ns.cli import train
 from abcd_ns.errors import UserError
+from benchmarks.tables import PAGE, with_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -133,3 +135,18 @@ def test_the_decibels_of_the_readme_are_of_stored_runs():
     said = re.findall(r"(?<![\d.])\d\d\.\d\d(?!\d|\.\d)", (ROOT / "README.md").read_text())
     assert len(said) > 4
     assert [value for value in said if value not in known] == []
+
+
+def test_the_tables_of_the_results_are_made_of_stored_runs():
+    page = PAGE.read_text()
+    assert page.count("<!-- table: ") >= 6
+    assert with_tables(page, PAGE.parent) == page
+
+
+def test_what_the_results_are_reproduced_by_is_understood():
+    script = ROOT / "benchmarks" / "reproduce.sh"
+    listed = subprocess.run([script], capture_output=True, text=True, check=True).stdout
+    commands = re.findall(r"abcd compare .*", listed)
+    assert len(commands) > 15
+    for command in commands:
+        parse(command)
