@@ -17,6 +17,7 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
     for scene in $small; do
         $row splatfacto/$scene 25 $scene 4 --steps 4000 --methods abcd-monolithic splatfacto-scaled $two_seeds
     done
+    $row splatfacto/fox-shipped 40 fox 4 --steps 30000 --methods splatfacto --evals 15
     $row splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
     for scene in $small; do
         $row budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
@@ -31,8 +32,12 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
     for scene in castle-P30 fox bonsai; do
         $row blocks/$scene 12 $scene 4 --seconds 180 --methods abcd --blocks 1 8 32
     done
+    $row blocks/land 12 land 1 --seconds 180 --methods abcd --blocks 1 8 32
+    $row gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
+        --vary training.density.min-contribution={0,1,4,16,64}
     $row peers/castle-P30 13 castle-P30 4 --seconds 120 --blocks 8 \
         --methods abcd-monolithic abcd abcd-exact abcd-partition abcd-ablated
+    $row peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
 }
 
 list() {
@@ -48,8 +53,10 @@ take() {
 }
 
 collect() {
-    local found=$out/$1/results.json
-    [[ ! -f $found ]] || install -D -m 644 "$found" "docs/results/$1.json"
+    local found=$out/$1
+    [[ ! -f $found/results.json ]] || install -D -m 644 "$found/results.json" "docs/results/$1.json"
+    [[ ! -f $found/memory_accuracy.png || ! -f docs/results/$1.png ]] ||
+        install -m 644 "$found/memory_accuracy.png" "docs/results/$1.png"
 }
 
 if (($# == 0)); then

@@ -8,8 +8,9 @@ sum of such weights when training ends. Here they go while it goes on, at a mini
 to its end: those that remain take their place, and each step costs less.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import Any
 
 import torch
@@ -19,7 +20,8 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render import Raster, Rasterizer, Shot
 from abcd_ns.engine.space.influence import weights
-from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
+from abcd_ns.engine.space.visibility import widest_slant
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View, centers_of
 
 BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
@@ -119,14 +121,17 @@ def floaters(
 
 
 def veils(
-    gaussians: Gaussians, views: Iterable[View], rasterizer: Rasterizer, antialiased: bool
+    gaussians: Gaussians, views: Sequence[View], rasterizer: Rasterizer, antialiased: bool
 ) -> Float[Tensor, "n"]:
     """Pixels that each Gaussian would fill of all views from before their near planes. A run draws nothing
     there; other viewers, which get only a file, do."""
-    found = gaussians.means.new_zeros(len(gaussians))
-    for view in views:
-        matrix = view.viewmat.to(gaussians.means)
-        z = gaussians.means @ matrix[2, :3] + matrix[2, 3]
+    means, found = gaussians.means, gaussians.means.new_zeros(len(gaussians))
+    reach, centers = widest_slant(views) * max(view.near for view in views), centers_of(views)
+    low, high = (end.cpu() for end in (means.amin(dim=0) - reach, means.amax(dim=0) + reach))
+    within = ((low < centers) & (centers < high)).all(dim=1).tolist()
+    for view in compress(views, within):
+        matrix = view.viewmat.to(means)
+        z = means @ matrix[2, :3] + matrix[2, 3]
         (near,) = torch.where((z > NEAR_PLANE) & (z < view.near))
         if len(near):  # nothing else is before them
             shot = Shot(replace(view, near=NEAR_PLANE), view.full)

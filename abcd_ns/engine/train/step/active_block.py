@@ -152,9 +152,9 @@ class ActiveBlock:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
         change too little. What is seen from now on soon counts for more."""
         run, before, found = self._run, len(self), 0.0
-        if run.density.wants_weights and run.share >= run.config.density.refine_stop:
+        if before and run.density.wants_weights and run.share >= run.config.density.refine_stop:
             live = live_gaussians(run.params).detach()
-            found = veils(live, run.views.values(), run.rasterizer, run.config.antialiased)
+            found = veils(live, list(run.views.values()), run.rasterizer, run.config.antialiased)
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()
