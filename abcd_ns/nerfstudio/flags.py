@@ -105,7 +105,7 @@ def check_tool(words: Sequence[str]) -> None:
     folders = [Path(out).parent] if out else []
     folders += [Path(given) for flag in FOLDERS if (given := _value(words, flag))]
     for folder in folders:  # the tools fail by a traceback, ns-eval at its end
-        there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+        there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
         if not there.is_dir() or not os.access(there, os.W_OK):
             why = "is read-only" if there.is_dir() else "is a file"
             raise UserError(f"{folder} cannot be made, {there} {why}: choose another folder.")
