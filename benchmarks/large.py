@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Loaded
 from abcd_ns.engine.render import CutShot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -201,7 +201,7 @@ def begin(town: Town, folder: Path, start: Start | None = None) -> Coordinator:
     names = [Path(str(view.index)) for view in views]
     args = town.args
     capture = Capture(views, names, lambda _: None, town.gaussians, town.blocks * args.gaussians)
-    live, budget = nothing_live(3), Budget(steps=10**7)
+    live, budget = nothing_active(3), Budget(steps=10**7)
     run = (
         options(town.blocks, town.args),
         capture,

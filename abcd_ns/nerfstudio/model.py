@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.gaussians.block_state import checksum
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Ownership, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, fog_in_white, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
@@ -144,7 +144,7 @@ class AbcdModel(SplatfactoModel):
         """The whole scene in one list, without a graph; while training, on a device. Not a property: it may
         read everything from disk."""
         if self._coordinator is None:
-            return live_gaussians(self.gauss_params).detach()
+            return active_gaussians(self.gauss_params).detach()
         return self._coordinator.scene.everything(device)
 
     # -- checkpoints ---------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ class AbcdModel(SplatfactoModel):
         for name, value in list(self.gauss_params.items()):
             self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
         super(SplatfactoModel, self).load_state_dict(state, **kwargs)  # splatfacto's takes all to the device
-        if expected is not None and checksum(live_gaussians(self.gauss_params)) != expected:
+        if expected is not None and checksum(active_gaussians(self.gauss_params)) != expected:
             raise UserError(
                 "This checkpoint is damaged: the checksum of its Gaussians is wrong. Go on with the run by "
                 "`ns-train --load-dir`, which saves another, or take an older one."
@@ -301,7 +301,7 @@ class AbcdModel(SplatfactoModel):
     ) -> viewed.BlockPictures:
         """Draws the scene by parts: of Gaussians what `keep` gives, or those in the crop box."""
         whole = self.scene()
-        if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
+        if isinstance(whole, StoredScene) and whole.is_active_as_a_whole:
             whole = MemoryScene(whole.tree, self.merged())  # or nobody knows which block holds how many
         shown = keep or self._crop
         scene = ChangedScene(whole, lambda _, found: shown(found))

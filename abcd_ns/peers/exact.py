@@ -88,7 +88,7 @@ class ExactTrainer(Trainer):
         self._residuals: list[Float[Tensor, "_h _w 3"]] = []
         self._pictures: list[Tensor] = []
         self._take()
-        self.scene.set_live(None, lambda: self._all.gaussians)
+        self.scene.set_active(None, lambda: self._all.gaussians)
 
     @property
     def batch(self) -> int:

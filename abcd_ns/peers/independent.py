@@ -28,7 +28,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.initialize import PointCloud
 from abcd_ns.engine.gaussians.packed import Packed
-from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -157,7 +157,7 @@ class BlocksAlone(Visits):
         cell = self._scene.tree.cell(block)
 
         def inside() -> Gaussians:
-            live = live_gaussians(params)
+            live = active_gaussians(params)
             return live[cell.contains(live.means)]
 
         return inside

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -134,7 +134,7 @@ def make_coordinator(
         StoredScene(tree, store, ram_bytes),
         views,
         rasterizer or TorchRasterizer(primitive=config.primitive),
-        *nothing_live(gaussians.sh_degree, device),
+        *nothing_active(gaussians.sh_degree, device),
         device=device,
     )
     room = LayerRoom(layer_bytes, layer_ram_bytes)

@@ -112,12 +112,12 @@ def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
     return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)
 
 
-def live_gaussians(params: Params) -> Gaussians:
+def active_gaussians(params: Params) -> Gaussians:
     """The live parameters as Gaussians, with their gradients' graph."""
     return Gaussians(**{name: params[name] for name in PARAM_NAMES})
 
 
-def nothing_live(
+def nothing_active(
     sh_degree: int, device: torch.device | str = "cpu"
 ) -> tuple[dict[str, Parameter], Optimizers]:
     """Empty parameters and one Adam for each, as 3DGS uses it: for a coordinator that nerfstudio does not

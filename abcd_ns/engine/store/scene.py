@@ -21,7 +21,7 @@ from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.coarse_model import split_by_block
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import Gaussians
 
@@ -65,7 +65,7 @@ class VisitScene(BlockScene, Protocol):
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+    def set_active(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
         """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest.
 
         Args:
@@ -116,7 +116,7 @@ class StoredScene(VisitScene):
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[BlockName, tuple[int, Box | None]] = {}
         self._stored_bounds: dict[BlockName, Box | None] = {}
-        self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
+        self._active: tuple[int | None, Callable[[], Gaussians]] | None = None
         self._rested = time.monotonic()
         self._pending_by_block: dict[int, BlockState] = {}
         self.pending: BlockState | None = None
@@ -160,7 +160,7 @@ class StoredScene(VisitScene):
             self._memory.shrink(unsaved)
             self._rested = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
-        live = blocks.get(LIVE)
+        live = blocks.get(ACTIVE)
         if within <= 0 or (unsaved > self.ram_bytes and not live):
             self.flush()
         self._writer.check()
@@ -203,23 +203,23 @@ class StoredScene(VisitScene):
         finally:
             self.store.close()
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
-        self._live, self._sh_degree = (block, live), sh_degree
+    def set_active(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+        self._active, self._sh_degree = (block, live), sh_degree
 
-    def clear_live(self) -> None:
+    def clear_active(self) -> None:
         """No block is live any more."""
-        self._live = None
+        self._active = None
 
     # -- what is there -------------------------------------------------------------------------------
 
     @property
-    def is_live_as_a_whole(self) -> bool:
+    def is_active_as_a_whole(self) -> bool:
         """Whether all blocks are live, and `count` is right in sum alone."""
-        return self._live is not None and self._live[0] is None
+        return self._active is not None and self._active[0] is None
 
-    def _is_live(self, block: int) -> bool:
+    def _is_active(self, block: int) -> bool:
         """Whether the block is, or all of them are."""
-        return self._live is not None and self._live[0] in (None, block)
+        return self._active is not None and self._active[0] in (None, block)
 
     def has(self, name: BlockName) -> bool:
         """Whether there is such a block, or anything under such a special name."""
@@ -273,18 +273,18 @@ class StoredScene(VisitScene):
             self._packed(block, whole=True)
 
     def gaussians(self, block: int) -> Gaussians:
-        if not self._is_live(block):
+        if not self._is_active(block):
             return self.drawn(block, "cpu")
-        live = self._all_live()
-        return live[self.tree.assign(live.means) == block] if self.is_live_as_a_whole else live
+        live = self._all_active()
+        return live[self.tree.assign(live.means) == block] if self.is_active_as_a_whole else live
 
-    def _all_live(self) -> Gaussians:
-        live = self._live[1]().detach()
+    def _all_active(self) -> Gaussians:
+        live = self._active[1]().detach()
         return live.of_degree(max(self._sh_degree, live.sh_degree))
 
     def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
         """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
-        if self._is_live(block):
+        if self._is_active(block):
             return super().drawn(block, device, which)
         packed, migrants = self._packed(block, whole=False), self.pending_for(block)
         rows = ~packed.tensors[IS_DEFERRED]  # they are not to be seen before the block's next visit
@@ -297,8 +297,8 @@ class StoredScene(VisitScene):
 
     def everything(self, device: torch.device | str) -> Gaussians:
         """All blocks, one after the other."""
-        if self.is_live_as_a_whole:  # who lives where is asked once
-            live = self._all_live()
+        if self.is_active_as_a_whole:  # who lives where is asked once
+            live = self._all_active()
             return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 
@@ -326,24 +326,24 @@ class StoredScene(VisitScene):
         return self._versions.get(block, 0)
 
     def count(self, block: int) -> int:
-        if not self._is_live(block):
+        if not self._is_active(block):
             return self.rows(block) + len(self.pending_for(block) or ())
         # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
-        return 0 if self.is_live_as_a_whole and block > 0 else len(self._live[1]())
+        return 0 if self.is_active_as_a_whole and block > 0 else len(self._active[1]())
 
     def parameters(self) -> int:
         """Of how many numbers all Gaussians are, what is live included; harmonics count up to the degree of
         each."""
-        counted = 0 if self._live is None else count_parameters(self._live[1]().features_rest.detach())
+        counted = 0 if self._active is None else count_parameters(self._active[1]().features_rest.detach())
         for block in range(self.tree.num_blocks):
-            if not self._is_live(block):
+            if not self._is_active(block):
                 migrants = self.pending_for(block)
                 counted += self._meta(block)["parameters"]
                 counted += 0 if migrants is None else count_parameters(migrants.gaussians.features_rest)
         return counted
 
     def bounds(self, block: int) -> Box | None:
-        if self._is_live(block):
+        if self._is_active(block):
             return bounds_of(self.gaussians(block))
         version = self.version(block)
         if block not in self._bounds or self._bounds[block][0] != version:

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from abcd_ns.engine.events import EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.commit import commit
-from abcd_ns.engine.store.special_blocks import LIVE, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, BlockName
 from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Planner, Visits
@@ -124,11 +124,11 @@ class Coordinator(Trainer):
         state = self.visit.finish()
         if active.is_whole:
             self._end_warm_up()
-        self.visit.live.let_go()  # a worker, or the next footprints, may need the device's memory
+        self.visit.block.let_go()  # a worker, or the next footprints, may need the device's memory
         updates = commit(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
-            updates[LIVE] = state.nobody
-        self.scene.clear_live()
+            updates[ACTIVE] = state.nobody
+        self.scene.clear_active()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
         rest_after_visit(self.run, active, state, updates, self.state.epoch)
@@ -156,7 +156,7 @@ class Coordinator(Trainer):
         known, unknown = self.visit.influence.found()
         self.visit.influence = None  # it holds on to what was live
         others = influence_on(
-            self.run, live_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
+            self.run, active_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
         )
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
@@ -177,7 +177,7 @@ class Coordinator(Trainer):
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
-            updates = {LIVE: self.visit.live.detached().unpinned()}
+            updates = {ACTIVE: self.visit.block.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()

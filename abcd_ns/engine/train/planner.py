@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
 from abcd_ns.engine.space.influence import overlaps, worth_training
@@ -61,7 +61,7 @@ class Visits(Protocol):
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
         """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile: all
         that is live."""
-        return lambda: live_gaussians(params)
+        return lambda: active_gaussians(params)
 
     def room(self) -> int | None:
         """Gaussians that may be added to the block; None for any number."""

@@ -71,7 +71,7 @@ class ActiveVisit:
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
     saved: bool = False
-    """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
+    """Whether the live block was put to rest in the middle of the visit, see special_blocks.ACTIVE."""
     batch: int = 0
     """Views in each of its steps; 0 for as many as steps have at most."""
     layer_seconds: float = 0.0

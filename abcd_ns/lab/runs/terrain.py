@@ -11,7 +11,7 @@ import torch
 
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.render import Rasterizer, loss, make_rasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -109,7 +109,7 @@ def _coordinator(
         background="black",
         density=DensityConfig(strategy="off"),  # or blocks would not be equal
     )
-    live, budget = nothing_live(3, device), Budget(steps=10**9)
+    live, budget = nothing_active(3, device), Budget(steps=10**9)
     return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *live, device=device))
 
 

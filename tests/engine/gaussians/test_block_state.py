@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
-from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, nothing_live
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, nothing_active
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import random_gaussians
 
@@ -32,7 +32,7 @@ def assert_same(a: BlockState, b: BlockState) -> None:
 
 
 def live(state: BlockState):
-    params, optimizers = nothing_live(1)
+    params, optimizers = nothing_active(1)
     attach(state, params, optimizers)
     return params, optimizers
 
@@ -96,4 +96,4 @@ def test_detached_tensors_do_not_follow_later_steps():
     rest = detach(params, optimizers, state.growth, state.clocks)
     take_steps(params, optimizers, 1)
     assert_same(rest, state)
-    assert not torch.equal(live_gaussians(params).means, rest.gaussians.means)
+    assert not torch.equal(active_gaussians(params).means, rest.gaussians.means)

@@ -16,7 +16,7 @@ from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.coarse_model import blocks_at_rest
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.engine.store.disks import PATIENCE, Disk, on_disk, wait_until
@@ -129,13 +129,13 @@ def test_what_waits_never_takes_more_ram_than_there_is(scene, disk):
 def test_a_large_live_block_is_written_beside_the_training_and_no_second_copy_is_made(scene, disk):
     scene.ram_bytes = 1
     disk.free.clear()
-    scene.rest(scene.tree, {LIVE: scene.state(0)}, {"step": 1}, within=SOON)
+    scene.rest(scene.tree, {ACTIVE: scene.state(0)}, {"step": 1}, within=SOON)
     assert disk.asked.wait(PATIENCE)
     assert disk.commits == []
     assert not scene.is_due(SOON)
     disk.free.set()
     wait_until(lambda: scene.is_due(SOON))
-    assert disk.commits == [({LIVE}, {"step": 1})]
+    assert disk.commits == [({ACTIVE}, {"step": 1})]
 
 
 # Errors
@@ -284,6 +284,6 @@ def test_a_long_visit_is_saved_by_the_clock(make, photos):
     coordinator.scene._rested -= 61.0
     train(coordinator, photos, steps=1)
     wait_until(lambda: on_disk(coordinator.scene).get("step") == 4)
-    assert coordinator.scene.rows(LIVE) == coordinator.count()
+    assert coordinator.scene.rows(ACTIVE) == coordinator.count()
     coordinator.close()
     assert make(resume=True, steps=50).state.step == 4

@@ -10,7 +10,7 @@ from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan
 from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, WHOLE
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -145,7 +145,7 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, bloc
     options = {"blocks": blocks, "steps": 30, "density": GROWING, "layer_bytes": 60_000}
     _, resumed = assert_resumes(make, photos, *stops, **options)
     store = resumed.scene.store
-    assert LIVE not in store.blocks or store.counts(LIVE) == 0
+    assert ACTIVE not in store.blocks or store.counts(ACTIVE) == 0
 
 
 def test_blocks_that_no_view_sees_are_left_alone(make, photos, start):

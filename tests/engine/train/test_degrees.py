@@ -138,9 +138,9 @@ def test_degrees_go_in_the_later_half_and_stay_away(make, photos, blocks):
         train_step(coordinator, photos)
         if coordinator.run.share < degrees.START:
             assert coordinator.scene.parameters() == whole
-        elif coordinator.state.active is not None and GONE in coordinator.visit.live.growth:
+        elif coordinator.state.active is not None and GONE in coordinator.visit.block.growth:
             live, adam = coordinator.params["features_rest"], coordinator.optimizers["features_rest"]
-            kept = 2 - coordinator.visit.live.growth[GONE]
+            kept = 2 - coordinator.visit.block.growth[GONE]
             moments = adam.state[live]
             for value in (live, moments["exp_avg"], moments["exp_avg_sq"]):
                 assert bool((degrees_in_use([value.detach()]) <= kept).all())
@@ -158,7 +158,7 @@ def test_a_run_that_was_interrupted_keeps_its_degrees(make, photos):
 
 def test_a_visit_that_draws_each_view_once_is_enough_to_judge_by(make, photos, truth):
     coordinator = make(start=truth, blocks=1, steps=20, density=STILL, batch=1)
-    live = coordinator.visit.live
+    live = coordinator.visit.block
     while coordinator.run.share < degrees.START:
         train_step(coordinator, photos)
     live.growth = {**live.growth, **statistics(len(live))}

@@ -7,7 +7,7 @@ import torch
 from gsplat.strategy import MCMCStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, nothing_active
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density import control as control_module
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl
@@ -22,7 +22,7 @@ BINOMIALS = MCMCStrategy().initialize_state()["binoms"]
 
 
 def live(gaussians: Gaussians):
-    params, optimizers = nothing_live(gaussians.sh_degree)
+    params, optimizers = nothing_active(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     return params, optimizers
 
@@ -110,7 +110,7 @@ def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
         before = torch.get_rng_state()
         control.after_step(params, optimizers, {}, (), (), clock(steps=7, refined=7, seed=seed))
         assert torch.equal(torch.get_rng_state(), before)
-        moved.append(live_gaussians(params).means.detach() - gaussians.means)
+        moved.append(active_gaussians(params).means.detach() - gaussians.means)
     assert torch.equal(moved[0], moved[1])
     assert not torch.equal(moved[0], moved[2])
     assert float(moved[0][:10].norm()) > 10 * float(moved[0][10:].norm())

@@ -124,7 +124,7 @@ def test_a_run_with_a_smaller_limit_goes_on_within_the_visit_that_was_under_way(
     scene, state = first.scene, RunState.from_json(first.scene.store.state)
     assert state.active.saved
     block = state.active.geometry.block
-    scene.clear_live()
+    scene.clear_active()
     before = scene.rows(block)
     cut_at_rest(scene, state, Limits(40, sole_limit=sole_limit))
     assert scene.tree.num_blocks > 2

@@ -7,7 +7,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.store.commit import pending_without, with_pending, without
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 
@@ -109,12 +109,12 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
         if in_visit and not active.is_joint:
             continue
         lives = in_visit and active.saved
-        rows = scene.rows(LIVE) if lives else scene.count(block)
+        rows = scene.rows(ACTIVE) if lives else scene.count(block)
         if not is_full(rows, scene.tree.num_blocks, limits):
             continue
         if lives:
-            live = scene.state(LIVE)
-            large = {block: live, LIVE: live.nobody}
+            live = scene.state(ACTIVE)
+            large = {block: live, ACTIVE: live.nobody}
         else:
             large = {block: with_pending(scene, block), **pending_without(scene, {block})}
         tree, parts = cut_full(scene, large, state, limits, Announcer())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import Announcer, Repaired
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
-from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.commit import state_for_visit
 from abcd_ns.engine.store.scene import VisitScene
@@ -199,7 +199,7 @@ class Health:
                     bad = ~torch.isfinite(adam[moment]).flatten(1).all(dim=1)
                     adam[moment][bad] = 0.0
                     self.count("moments", int(bad.sum()))
-        live = live_gaussians(self._params)
+        live = active_gaussians(self._params)
         rows = unsound(live).nonzero()[:, 0]
         if len(rows) == 0:
             return

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, raise_degree
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, raise_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
@@ -153,7 +153,7 @@ class ActiveBlock:
         change too little. What is seen from now on soon counts for more."""
         run, before, found = self._run, len(self), 0.0
         if run.density.wants_weights and run.share >= run.config.density.refine_stop:
-            live = live_gaussians(run.params).detach()
+            live = active_gaussians(run.params).detach()
             found = veils(live, run.views.values(), run.rasterizer, run.config.antialiased)
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
         run.health.count("pruned", before - len(self))
