@@ -84,7 +84,7 @@ def run(
     coordinator = begin(capture, blocks, args, folder)
     clock, views = StageClock(), 0
     scene = coordinator.scene
-    scene.rest = clock.timed("commit", scene.rest)  # as far as the training waits for it
+    scene.persist = clock.timed("commit", scene.persist)  # as far as the training waits for it
     visit_training.layers_of_visit = clock.timed("layers", layers_of_visit)
     while not coordinator.finished:
         if coordinator.progress < 0.5:

@@ -157,7 +157,7 @@ class ExactTrainer(Trainer):
         if self.finished:
             self.save()
         elif self.scene.is_due(self.config.commit_seconds):
-            self.rest(self.config.commit_seconds)
+            self.persist(self.config.commit_seconds)
 
     def gradients(self) -> Gradients:
         """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given."""
@@ -177,11 +177,11 @@ class ExactTrainer(Trainer):
         """Gaussians in the whole scene."""
         return len(self._all)
 
-    def rest(self, within: float) -> None:
+    def persist(self, within: float) -> None:
         """Put every block to rest; there are no visits."""
         held, nobody = split_by_block(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
-        self.run.rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
+        self.run.persist(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
     def restore(self) -> None:
         """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""

@@ -113,7 +113,7 @@ def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
     tree = BlockTree.from_json(store.header["tree"])
     scene = StoredScene(tree, store)
-    in_store = torch.cat([scene.gaussians_at_rest(block).means for block in range(tree.num_blocks)])
+    in_store = torch.cat([scene.stored_with_pending(block).means for block in range(tree.num_blocks)])
     special = [other for other in store.blocks if isinstance(other, str) and other != PENDING]
     assert all(store.counts(other) == 0 for other in special)
     assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)

@@ -13,7 +13,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
-from abcd_ns.peers.independent import independent_at_rest, independent_trainer
+from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from tests.reference.scenes import STILL, listen, stop, whole_scene
 from tests.reference.simulated_device import DEVICE
 
@@ -34,7 +34,7 @@ def assert_on_device(coordinator) -> None:
         assert {parameter.device, *(state[key].device for key in ("step", *MOMENTS))} == {DEVICE}
 
 
-APART = {"kind": independent_trainer, "content": independent_at_rest, "layers": False, "migrate": False}
+APART = {"kind": independent_trainer, "content": independent_blocks, "layers": False, "migrate": False}
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ class AssignedScene(VisitScene):
     def rows(self, name: BlockName) -> int:
         return len(self.state(name))
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
+    def stored_with_pending(self, block: int) -> Gaussians:
         return self.state(block).gaussians
 
     def gaussians(self, block: int) -> Gaussians:

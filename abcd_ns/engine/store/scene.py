@@ -62,7 +62,7 @@ class VisitScene(BlockScene, Protocol):
     def rows(self, name: BlockName) -> int:
         """Gaussians at rest under a name, the pending migrants of a block left out; nothing is read."""
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
+    def stored_with_pending(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
 
     def set_active(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
@@ -117,7 +117,7 @@ class StoredScene(VisitScene):
         self._bounds: dict[BlockName, tuple[int, Box | None]] = {}
         self._stored_bounds: dict[BlockName, Box | None] = {}
         self._active: tuple[int | None, Callable[[], Gaussians]] | None = None
-        self._rested = time.monotonic()
+        self._persisted = time.monotonic()
         self._pending_by_block: dict[int, BlockState] = {}
         self.pending: BlockState | None = None
         """All Gaussians that wait for their blocks' visits, in the order in which they came."""
@@ -125,7 +125,7 @@ class StoredScene(VisitScene):
 
     # -- changes -------------------------------------------------------------------------------------
 
-    def rest(
+    def persist(
         self,
         tree: BlockTree,
         blocks: Mapping[BlockName, BlockState | Packed],
@@ -143,7 +143,7 @@ class StoredScene(VisitScene):
 
         Raises:
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
-                written by the next `rest` or `flush`.
+                written by the next `persist` or `flush`.
         """
         packed = {n: block if isinstance(block, Packed) else block.packed() for n, block in blocks.items()}
         with self._writer.mutex:
@@ -158,7 +158,7 @@ class StoredScene(VisitScene):
                 self._sort(blocks.get(PENDING, self.pending))
             unsaved = self.unsaved_bytes  # under the lock: the writer takes out what it has written
             self._memory.shrink(unsaved)
-            self._rested = time.monotonic()
+            self._persisted = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
         live = blocks.get(ACTIVE)
         if within <= 0 or (unsaved > self.ram_bytes and not live):
@@ -190,10 +190,10 @@ class StoredScene(VisitScene):
     def is_due(self, within: float) -> bool:
         """Whether something should be put to rest again: nothing was for so many seconds, and nothing is
         being written, so that RAM holds one copy of a large live block; 0 is no limit."""
-        return 0 < within <= time.monotonic() - self._rested and not self._writer.busy
+        return 0 < within <= time.monotonic() - self._persisted and not self._writer.busy
 
     def flush(self) -> None:
-        """Return when all that was put to rest is durable; what failed before is tried again. See `rest`."""
+        """Return when all that was put to rest is durable; what failed before is tried again. See `persist`."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -302,7 +302,7 @@ class StoredScene(VisitScene):
             return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
+    def stored_with_pending(self, block: int) -> Gaussians:
         stored, migrants = self.stored(block), self.pending_for(block)
         return stored if migrants is None else Gaussians.cat([stored, migrants.gaussians])
 

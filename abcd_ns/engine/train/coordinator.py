@@ -99,7 +99,7 @@ class Coordinator(Trainer):
         if self.visit.is_over:
             self.end_visit()
         elif self.scene.is_due(self.config.commit_seconds):
-            self.rest(AT_ONCE)
+            self.persist(AT_ONCE)
 
     @property
     def finished(self) -> bool:
@@ -131,7 +131,7 @@ class Coordinator(Trainer):
         self.scene.clear_active()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
-        rest_after_visit(self.run, active, state, updates, self.state.epoch)
+        persist_after_visit(self.run, active, state, updates, self.state.epoch)
         if not active.is_whole and not self.state.queue:
             self.announce(EpochEnded(self.state.epoch, self.state.step))
 
@@ -149,7 +149,7 @@ class Coordinator(Trainer):
             return
         self._final_pruning.run()
         self.state.pruned_at = self.state.step
-        self.run.rest(self.scene.tree, {}, 0.0)
+        self.run.persist(self.scene.tree, {}, 0.0)
 
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
@@ -172,7 +172,7 @@ class Coordinator(Trainer):
         """Bytes that the layers of the visit that is under way take."""
         return self.visit.layers.nbytes if self.visit.layers else 0
 
-    def rest(self, within: float) -> None:
+    def persist(self, within: float) -> None:
         """Put the live block to rest under a name of its own, and the run's state."""
         updates = {}
         if (active := self.state.active) is not None:
@@ -181,7 +181,7 @@ class Coordinator(Trainer):
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()
-        self.run.rest(self.scene.tree, updates, within)
+        self.run.persist(self.scene.tree, updates, within)
 
     def restore(self) -> None:
         """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
@@ -202,7 +202,7 @@ def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Ite
     return influence(whole, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
 
 
-def rest_after_visit(
+def persist_after_visit(
     run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
 ) -> None:
     """Put what a visit changed to rest, blocks that have outgrown their limit in parts, and tell listeners.
@@ -215,7 +215,7 @@ def rest_after_visit(
     tree, parts = cut_full(run.scene, updates, run.state, run.limits, run.announce)
     if active.is_joint and tree.num_blocks > 1:
         run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
-    run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
+    run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])
     run.announce(

@@ -255,7 +255,7 @@ class Planner(Visits):
         """Of MANY views, those in which a mean of the block's lies, as far as SAMPLE tell; of fewer, none."""
         if len(views) <= MANY:
             return ()
-        means = self._scene.gaussians_at_rest(block).means
+        means = self._scene.stored_with_pending(block).means
         found, _, inner, _ = self._culling
         rows = [row for row, view in enumerate(found) if view in views]
         points = in_float64(means[:: -(-len(means) // SAMPLE)]).cpu()
@@ -284,5 +284,5 @@ class Planner(Visits):
     def _footprints(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
         if not views:
             return VisitGeometry(block, {})
-        gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
+        gaussians = self._scene.stored_with_pending(block).to(self._run.device)
         return footprints(gaussians, block, views.values(), self._run.rasterizer, share)

@@ -148,12 +148,12 @@ class TrainingRun:
         """Gaussians in the whole scene, the live block included."""
         return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
 
-    def rest(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
+    def persist(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
         """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
         self.state.poses = self.poses.to_json()
         tables = self.light.changed() if self.light is not None else {}
-        self.scene.rest(tree, {**updates, **tables}, self.state.to_json(), within)
+        self.scene.persist(tree, {**updates, **tables}, self.state.to_json(), within)
 
     def restore(self) -> None:
         """Stand where the store's newest generation stands."""

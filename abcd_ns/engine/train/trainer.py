@@ -130,7 +130,7 @@ class Trainer(ABC):
     # -- at rest -------------------------------------------------------------------------------------
 
     @abstractmethod
-    def rest(self, within: float) -> None:
+    def persist(self, within: float) -> None:
         """Put what is live to rest, and the run's state; on disk within so many seconds."""
 
     def save(self, pin: str | None = None) -> None:
@@ -139,7 +139,7 @@ class Trainer(ABC):
         Args:
             pin: keep this state under a name until it is unpinned.
         """
-        self.rest(0.0)
+        self.persist(0.0)
         if pin is not None:
             self.scene.store.pin(pin)
 

@@ -70,17 +70,17 @@ def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
         batches: (views in a step, steps); the block is taken out and put back in between.
     """
     params, adam = nothing_active(sh_degree=0)
-    pace, rest = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
+    pace, stored = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
     for batch, steps in batches:
-        attach(rest, params, adam, batch=batch)
-        clocks = rest.clocks
+        attach(stored, params, adam, batch=batch)
+        clocks = stored.clocks
         for _ in range(steps):
             pace.set(batch, 0, means_decay=1.0)
             params["scales"].grad = torch.ones_like(params["scales"])
             adam["scales"].step()
             clocks = replace(clocks, adam_views=clocks.adam_views + batch)
             yield corrected_moments(adam["scales"], params["scales"])
-        rest = detach(params, adam, {}, clocks)
+        stored = detach(params, adam, {}, clocks)
 
 
 @pytest.mark.parametrize(

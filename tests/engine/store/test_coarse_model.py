@@ -9,7 +9,7 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, split_off
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, stored_blocks
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
@@ -30,7 +30,7 @@ def test_a_store_begins_with_each_point_in_its_block_or_deferred():
     cloud = cloud_from_points(*random_points(90, 2.0), sh_degree=1)
     tree = build_kd(cloud.means, 4)
     coarse, others = split_off(cloud, 40, seed=3)
-    content = dict(blocks_at_rest(tree, cloud, room=40, seed=3))
+    content = dict(stored_blocks(tree, cloud, room=40, seed=3))
     deferred = content.pop(DEFERRED)
     assert all(torch.equal(deferred.tensors[name], value) for name, value in others.tensors.items())
     owner, whole = tree.assign(coarse.means), coarse.gaussians()
@@ -89,7 +89,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
             assert len(live) == found
             assert bool(faint.any())
             # What windows and views go by.
-            assert len(scene.gaussians_at_rest(active.geometry.block)) == found
+            assert len(scene.stored_with_pending(active.geometry.block)) == found
             visited.add(active.geometry.block)
         for block in set(range(4)) - visited:
             assert 0 < len(scene.gaussians(block)) < scene.count(block)

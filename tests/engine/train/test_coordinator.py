@@ -128,9 +128,9 @@ def test_migrants_take_their_moments_along(make, photos):
         coordinator.params["means"][0] = coordinator.scene.gaussians(other).means[0]
     moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
     row = coordinator.params["scales"][0].detach().clone()
-    arrived_before, at_rest = coordinator.scene.count(other), coordinator.scene.state(other)
+    arrived_before, stored = coordinator.scene.count(other), coordinator.scene.state(other)
     train_step(coordinator, photos)
-    assert equal(coordinator.scene.state(other).gaussians, at_rest.gaussians)
+    assert equal(coordinator.scene.state(other).gaussians, stored.gaussians)
     arrived = with_pending(coordinator.scene, other)
     assert len(arrived) == coordinator.scene.count(other) == arrived_before + 1
     assert equal(coordinator.scene.gaussians(other), arrived.gaussians)
@@ -168,7 +168,7 @@ def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(make,
     coordinator.state.active = None
     coordinator.state.queue.clear()
     come = coordinator.scene.state(unseen)[:3]
-    coordinator.run.rest(coordinator.scene.tree, {PENDING: come}, within=0.0)
+    coordinator.run.persist(coordinator.scene.tree, {PENDING: come}, within=0.0)
     assert coordinator.scene.pending_for(unseen) is not None
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)

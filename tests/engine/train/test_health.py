@@ -69,7 +69,7 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     coordinator = make(blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
-    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Repaired)
+    before, told = coordinator.scene.stored_with_pending(block), listen(coordinator, Repaired)
     with torch.no_grad():
         coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0

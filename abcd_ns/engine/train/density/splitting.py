@@ -97,7 +97,7 @@ def cut_full(
     return tree, updates
 
 
-def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
+def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
     """Cut the blocks of a run that resumes with smaller limits than it had; nothing where all are in order.
 
     A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
@@ -120,4 +120,4 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
         tree, parts = cut_full(scene, large, state, limits, Announcer())
         if tree is not scene.tree:
             state.active = active = None if active is None or active.is_joint else active
-            scene.rest(tree, parts, state.to_json())
+            scene.persist(tree, parts, state.to_json())

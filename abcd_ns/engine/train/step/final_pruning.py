@@ -188,7 +188,7 @@ class FinalPruning:
             state = with_pending(scene, block)
             stays = state.deferred.clone()  # who is not drawn
             stays[~state.deferred] = worth > least
-            run.rest(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
+            run.persist(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone
 
 
