@@ -65,8 +65,8 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     options = RunOptions(TrainingConfig(seed=args.seed), blocks=blocks, workers=1)
     rasterizer, budget = make_rasterizer("auto", device), Budget(seconds=args.seconds)
-    live, store, trained_on = nothing_active(3, device), folder / "store", capture.capture(3)
-    return begin_run(options, trained_on, device, store, budget, rasterizer, *live, say=lambda _: None)
+    empty, store, trained_on = nothing_active(3, device), folder / "store", capture.capture(3)
+    return begin_run(options, trained_on, device, store, budget, rasterizer, *empty, say=lambda _: None)
 
 
 def run(

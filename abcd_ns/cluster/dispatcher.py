@@ -269,7 +269,7 @@ class Dispatcher(Coordinator):
             self.announce(EpochEnded(epoch, state.step))
         return True
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     def restore(self) -> None:
         """As the coordinator's; what workers are at is dropped, and planned again."""

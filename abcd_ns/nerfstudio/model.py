@@ -1,4 +1,4 @@
-"""Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
+"""Splatfacto's model around the engine: the active block in training, the merged scene for other tools."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -69,7 +69,7 @@ class AbcdModelConfig(SplatfactoModelConfig):
 class AbcdModel(SplatfactoModel):
     """Draws batches for training and whole pictures for evaluation, viewer and export.
 
-    While training, the registered parameters are the live block alone and the rest of the scene is reached
+    While training, the registered parameters are the active block alone and the rest of the scene is reached
     through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene,
     on the device or, where that has no room to draw it at once, on the CPU. `state_dict` gives the merged
     scene in either case.
@@ -99,7 +99,7 @@ class AbcdModel(SplatfactoModel):
         self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
 
     def follow(self, coordinator: Trainer) -> None:
-        """From now on the scene is the coordinator's, and the registered parameters its live block."""
+        """From now on the scene is the coordinator's, and the registered parameters its active block."""
         self._coordinator, self._parted = coordinator, None
 
     def draws_with(self) -> Rasterizer:
@@ -132,7 +132,7 @@ class AbcdModel(SplatfactoModel):
         return self.features_dc
 
     def scene(self) -> BlockScene:
-        """The whole scene by blocks, the live one included."""
+        """The whole scene by blocks, the active one included."""
         if self._coordinator is not None:
             return self._coordinator.scene
         means, tree = self.gauss_params["means"], self.tree
@@ -150,7 +150,7 @@ class AbcdModel(SplatfactoModel):
     # -- checkpoints ---------------------------------------------------------------------------------
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """The merged scene under splatfacto's names, whatever is live."""
+        """The merged scene under splatfacto's names, whatever is active."""
         state = super().state_dict(*args, **kwargs)
         if self._coordinator is not None:
             prefix, merged = kwargs.get("prefix", ""), self.merged()

@@ -75,7 +75,7 @@ class ExactTrainer(Trainer):
     """Every step trains all blocks.
 
     `render` gives pictures whose gradient the caller's backward takes; `after_step` hands it on to blocks.
-    Between steps no Gaussians are live, so that the caller's optimizers have nothing to step.
+    Between steps the run's parameters are empty, so that the caller's optimizers have nothing to step.
     """
 
     def __init__(self, run: TrainingRun) -> None:
@@ -178,7 +178,7 @@ class ExactTrainer(Trainer):
         return len(self._all)
 
     def persist(self, within: float) -> None:
-        """Put every block to rest; there are no visits."""
+        """Persist every block; there are no visits."""
         held, nobody = split_by_block(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
         self.run.persist(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)

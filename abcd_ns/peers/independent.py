@@ -124,7 +124,7 @@ class BlocksAlone(Visits):
         self._looked_at: int | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
-        """The next block's one visit; the block is put to rest as it begins, with what lies around it."""
+        """The next block's one visit; the block is persisted as it begins, with what lies around it."""
         run, state = self._run, self._run.state
         began, since = run.stopwatch.seconds, run.progress
         if not state.views:
@@ -157,8 +157,8 @@ class BlocksAlone(Visits):
         cell = self._scene.tree.cell(block)
 
         def inside() -> Gaussians:
-            live = active_gaussians(params)
-            return live[cell.contains(live.means)]
+            gaussians = active_gaussians(params)
+            return gaussians[cell.contains(gaussians.means)]
 
         return inside
 

@@ -91,10 +91,10 @@ def train(
     first = partial(cloud_of, places, colors, views, training)
     capture = Capture(views, names, target, first, len(places))
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
-    live, budget = nothing_active(training.sh_degree, device), Budget(steps, options.max_seconds)
+    empty, budget = nothing_active(training.sh_degree, device), Budget(steps, options.max_seconds)
     threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
     try:
-        trainer = begin_run(options, capture, device, folder, budget, rasterizer, *live, LOG.info)
+        trainer = begin_run(options, capture, device, folder, budget, rasterizer, *empty, LOG.info)
         with closing(trainer):
             if listener is not None:
                 trainer.announce.subscribe(listener)

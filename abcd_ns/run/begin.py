@@ -1,4 +1,4 @@
-"""How a run begins or resumes: its blocks at rest, what fits on the device, and what trains it."""
+"""How a run begins or resumes: its stored blocks, what fits on the device, and what trains it."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -214,7 +214,7 @@ def _coarse_model_size(
     return coarse_model_size(training, largest, 0 if options.gaussian_bytes else capture.pixels)
 
 
-# -- at rest -------------------------------------------------------------------------------------------
+# -- the store -----------------------------------------------------------------------------------------
 
 
 def _new_store(

@@ -28,7 +28,7 @@ def target(photos):
 
 
 def assert_on_device(coordinator) -> None:
-    """The live block is all there: parameters, moments, and Adam's steps."""
+    """The active block is all there: parameters, moments, and Adam's steps."""
     for name, parameter in coordinator.params.items():
         state = coordinator.optimizers[name].state[parameter]
         assert {parameter.device, *(state[key].device for key in ("step", *MOMENTS))} == {DEVICE}

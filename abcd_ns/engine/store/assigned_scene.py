@@ -44,8 +44,8 @@ class AssignedScene(VisitScene):
 
     # What only the active block is asked for is of the assigned one, as its visit found it.
 
-    def set_active(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
-        self._active = live
+    def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
+        self._active = gaussians
 
     def state(self, name: BlockName) -> BlockState:  # noqa: ARG002
         return self._state

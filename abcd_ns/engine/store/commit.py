@@ -1,4 +1,4 @@
-"""Where the Gaussians of a visit come to rest, on the CPU: in their block, or pending for another."""
+"""Where the Gaussians of a visit are stored, on the CPU: in their block, or pending for another."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -40,7 +40,7 @@ def _blocks(scene: VisitScene, block: BlockName) -> range:
 
 
 def with_pending(scene: VisitScene, block: int) -> BlockState:
-    """A block at rest, joined by those that wait for its next visit."""
+    """A stored block, joined by those that wait for its next visit."""
     state, migrants = scene.state(block), scene.pending_for(block)
     return state if migrants is None else join([state, migrants])
 

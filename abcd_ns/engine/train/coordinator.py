@@ -1,7 +1,7 @@
 """Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
 
-`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not live lies at rest in
-the store; listeners are told what happens.
+`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not active is stored.
+Listeners are told what happens.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -30,7 +30,7 @@ from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 
 AT_ONCE = 1e-3
-"""Seconds: what a long visit puts to rest is written as soon as no other write is under way. The last one may
+"""Seconds: what a long visit persists is written as soon as no other write is under way. The last one may
 have begun just now with a state of long ago; to count from that, a kill would lose twice `commit_seconds`."""
 
 
@@ -80,7 +80,7 @@ class Coordinator(Trainer):
         return self.visit.next_batch()
 
     def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in the live parameters."""
+        """Draw the active block between its layers; differentiable in its parameters."""
         return self.visit.render(batch)
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
@@ -103,8 +103,8 @@ class Coordinator(Trainer):
 
     @property
     def finished(self) -> bool:
-        """Whether the budget is used up, and nothing is live: seconds may run out just after a visit was
-        found not to be over, and then it takes one more step."""
+        """Whether the budget is used up, and no block is active. Seconds may run out just after a visit was
+        found not to be over; then it takes one more step."""
         return self.state.active is None and super().finished
 
     # -- a visit -------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ class Coordinator(Trainer):
             self.scene.read_ahead(plan.block)
 
     def end_visit(self) -> None:
-        """Put the block to rest, and what left it into pending migrants; cut what has outgrown a block."""
+        """Persist the block, and what left it as pending migrants; cut what has outgrown a block."""
         active = self.run.active
         state = self.visit.finish()
         if active.is_whole:
@@ -154,13 +154,13 @@ class Coordinator(Trainer):
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
-        self.visit.influence = None  # it holds on to what was live
+        self.visit.influence = None  # it holds on to what was active
         others = influence_on(
             self.run, active_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
         )
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     @property
     def layer_limit(self) -> int:
@@ -173,7 +173,7 @@ class Coordinator(Trainer):
         return self.visit.layers.nbytes if self.visit.layers else 0
 
     def persist(self, within: float) -> None:
-        """Put the live block to rest under a name of its own, and the run's state."""
+        """Persist the active block under a name of its own, and the run's state."""
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
@@ -184,7 +184,7 @@ class Coordinator(Trainer):
         self.run.persist(self.scene.tree, updates, within)
 
     def restore(self) -> None:
-        """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
+        """Go on from the store's newest generation: where `save` was called, or something was persisted."""
         self.run.restore()
         if self.state.active is not None:
             self.visit.attach(self.state.active)
@@ -205,11 +205,11 @@ def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Ite
 def persist_after_visit(
     run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
 ) -> None:
-    """Put what a visit changed to rest, blocks that have outgrown their limit in parts, and tell listeners.
+    """Persist what a visit changed, blocks that have outgrown their limit in parts, and tell listeners.
 
     Args:
         state: what the visit made of its block.
-        updates: what comes to rest of it.
+        updates: what is persisted of it.
         epoch: that it belongs to.
     """
     tree, parts = cut_full(run.scene, updates, run.state, run.limits, run.announce)

@@ -39,7 +39,7 @@ LAYER_SHARE = 1 / 8
 PHOTO_SHARE = 1 / 8
 """Of the device's budget, for photos that are kept there."""
 ACTIVE_COPIES = 5
-"""Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
+"""Of each value while a block is active: the parameter, its gradient, two moments, and the stored block."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class DeviceNeeds:
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
         primitive: what a Gaussian is.
-        active_degree: of harmonics of a live block; None for `sh_degree`, that of the scene.
+        active_degree: of harmonics of an active block; None for `sh_degree`, that of the scene.
     """
 
     pixels: int
@@ -71,7 +71,7 @@ class DeviceNeeds:
 
     @property
     def parameter_bytes(self) -> int:
-        """Of one Gaussian's parameters, while it is live."""
+        """Of one Gaussian's parameters, while it is active."""
         return parameter_bytes(self.sh_degree if self.active_degree is None else self.active_degree)
 
     @property
@@ -103,10 +103,10 @@ class DeviceNeeds:
         pixels = max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT
         return pixels + LEAST_PASS * frozen + DEVICE_SPLATS * drawn
 
-    def frozen_beside(self, live: int) -> int:
-        """Frozen Gaussians that a pass may draw beside so many live ones: in the room that these have for
+    def frozen_beside(self, active: int) -> int:
+        """Frozen Gaussians that a pass may draw beside so many active ones. Their room is what these have for
         gradients and for their own drawings, which have not begun."""
-        free = live * (self.gaussian_bytes - 3 * self.parameter_bytes)
+        free = active * (self.gaussian_bytes - 3 * self.parameter_bytes)
         return free // drawing_bytes(self.sh_degree, self.primitive)
 
     @property
@@ -157,7 +157,7 @@ def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | 
     """What a visit takes in a run on images of so many pixels at most, in one block or several.
 
     Args:
-        sh_degree: of the live block; None for the one that limits count on.
+        sh_degree: of the active block; None for the one that limits count on.
     """
     return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
@@ -219,7 +219,7 @@ def parameter_bytes(sh_degree: int) -> int:
 
 
 def active_bytes(gaussians: int, sh_degree: int) -> int:
-    """What a live block of so many Gaussians takes, pictures not counted."""
+    """What an active block of so many Gaussians takes, pictures not counted."""
     return gaussians * parameter_bytes(sh_degree) * ACTIVE_COPIES
 
 

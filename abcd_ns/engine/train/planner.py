@@ -59,8 +59,8 @@ class Visits(Protocol):
         """
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
-        """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile: all
-        that is live."""
+        """Its block is active, at the visit's beginning or after a resume. What others see of it meanwhile:
+        all that is active."""
         return lambda: active_gaussians(params)
 
     def room(self) -> int | None:
@@ -111,12 +111,12 @@ class Planner(Visits):
 
     def room(self) -> int | None:
         """What the limits of scene and block leave; in the warm-up what the memory of a visit holds."""
-        run, live = self._run, len(self._run.params["means"])
+        run, gaussians = self._run, len(self._run.params["means"])
         if run.active.is_whole:
             deferred, limit = self._scene.rows(DEFERRED), self._config.density.limit
             most = self._config.limits.coarse_gaussians
-            return (most if limit is None else min(most, limit - deferred)) - live
-        return self._config.room(run.count(), live, run.limits.of_block(run.blocks))
+            return (most if limit is None else min(most, limit - deferred)) - gaussians
+        return self._config.room(run.count(), gaussians, run.limits.of_block(run.blocks))
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the coarse model of all blocks is trained."""

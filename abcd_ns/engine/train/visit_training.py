@@ -73,8 +73,7 @@ class VisitTraining:
         return most if active is None else active.batch or most
 
     def attach(self, active: ActiveVisit) -> None:
-        """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
-        found it."""
+        """Make the visit's block active and draw its layers, at its beginning or where a save found it."""
         run, state = self.run, self.run.state
         self.block.attach(active, self.batch, max(active.sh_degree, self.degree))
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
@@ -95,10 +94,10 @@ class VisitTraining:
 
     def _shown_in(self, views: Sequence[int]) -> dict[int, float]:
         """The influence that the block has on each of these views by now."""
-        run, shown, live = self.run, {}, active_gaussians(self.run.params)
+        run, shown, gaussians = self.run, {}, active_gaussians(self.run.params)
         for view in views:
             seen, options = self.whole(view), {"antialiased": run.config.antialiased}
-            shown[view] = share_shown(live, run.rasterizer, seen.shot, seen.in_front, **options)
+            shown[view] = share_shown(gaussians, run.rasterizer, seen.shot, seen.in_front, **options)
         return shown
 
     # -- a step --------------------------------------------------------------------------------------
@@ -123,7 +122,7 @@ class VisitTraining:
         return Batch(step, samples, run.config.limits.batch_limit)
 
     def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in the live parameters."""
+        """Draw the active block between its layers; differentiable in its parameters."""
         rendered = self._rendered = self._draw(batch.samples)
         if not self.run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
@@ -249,11 +248,11 @@ class VisitTraining:
         return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
 
     def _draw(self, samples: Sequence[Sample]) -> Rendered:
-        run, live = self.run, active_gaussians(self.run.params)
+        run, gaussians = self.run, active_gaussians(self.run.params)
         rasters = run.rasterizer.draw(
-            live,
+            gaussians,
             [sample.shot for sample in samples],
-            sh_degree=min(self.degree, live.sh_degree),  # by time, it may have risen since `next_batch`
+            sh_degree=min(self.degree, gaussians.sh_degree),  # by time, it may have risen since `next_batch`
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
             residual_sums=run.density.asks(run.share, first=self.block.clocks.visits == 0),

@@ -86,7 +86,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
 
 
 def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
-    """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
+    """The land, stored tile by tile, or all tiles as one block, which takes the RAM that it takes."""
     whole, tiles = job.method == "abcd-monolithic", range(land.tiles)
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
@@ -109,8 +109,8 @@ def _coordinator(
         background="black",
         density=DensityConfig(strategy="off"),  # or blocks would not be equal
     )
-    live, budget = nothing_active(3, device), Budget(steps=10**9)
-    return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *live, device=device))
+    empty, budget = nothing_active(3, device), Budget(steps=10**9)
+    return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *empty, device=device))
 
 
 def _train(

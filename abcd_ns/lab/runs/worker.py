@@ -142,14 +142,14 @@ class Training:
             drawing: layers are about to be drawn, and steps have not begun.
         """
         coordinator = self.coordinator
-        config, live = coordinator.config, len(coordinator.params["means"])
+        config, gaussians = coordinator.config, len(coordinator.params["means"])
         degree = active_gaussians(coordinator.params).sh_degree
         needs = needs_of_step(config, 0, coordinator.batch, degree)
-        held = live * needs.gaussian_bytes
+        held = gaussians * needs.gaussian_bytes
         if drawing:  # parameters and their moments, and of others so many as one pass draws
             most = config.limits.pass_gaussians or default_pass(coordinator.scene)
-            frozen = min(most, coordinator.count() - live) if config.recipe.layers else 0
-            held = live * 3 * needs.parameter_bytes
+            frozen = min(most, coordinator.count() - gaussians) if config.recipe.layers else 0
+            held = gaussians * 3 * needs.parameter_bytes
             held += frozen * drawing_bytes(config.sh_degree, config.primitive)
         self.gaussian_bytes = max(self.gaussian_bytes, held)
 

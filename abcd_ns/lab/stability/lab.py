@@ -131,9 +131,9 @@ class Lab:
         blocks = 1 if method == "abcd-monolithic" else blocks
         options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
         folder = Path(tempfile.mkdtemp(dir=self._folder)) / STORE
-        live = nothing_active(SH_DEGREE)
+        empty = nothing_active(SH_DEGREE)
         capture, steps, device = stage.capture(SH_DEGREE), Budget(steps=budget), torch.device("cpu")
-        return begin_run(options, capture, device, folder, steps, self.rasterizer, *live, say=lambda _: None)
+        return begin_run(options, capture, device, folder, steps, self.rasterizer, *empty, say=lambda _: None)
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.

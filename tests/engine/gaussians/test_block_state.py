@@ -1,4 +1,4 @@
-"""Blocks at rest, and swapping them into live parameters and Adam."""
+"""Stored blocks, and swapping them into active parameters and Adam."""
 
 import copy
 from dataclasses import replace
@@ -66,7 +66,7 @@ def test_tensors_of_unequal_length_are_refused():
         BlockState(random_gaussians(3), random_gaussians(2), random_gaussians(3))
 
 
-def test_a_block_that_rested_trains_as_if_it_had_not():
+def test_a_block_that_was_persisted_trains_as_if_it_had_not():
     state = some_state(6)
     stayed = active(state)
     take_steps(*stayed, 5)

@@ -41,7 +41,7 @@ def test_a_store_begins_with_each_point_in_its_block_or_deferred():
     assert list(content) == [0, 1, 2, 3]
 
 
-def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, photos):
+def test_the_whole_coarse_model_is_active_and_nothing_else_is_seen(make, views, photos):
     coordinator = make(blocks=4, steps=40, coarse_model=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
@@ -84,9 +84,9 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
         coordinator.next_batch()
         active = coordinator.state.active
         if active.done == 0:
-            live, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
-            faint = torch.sigmoid(live).sub(REVEALED_OPACITY).abs() < 1e-6
-            assert len(live) == found
+            logits, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
+            faint = torch.sigmoid(logits).sub(REVEALED_OPACITY).abs() < 1e-6
+            assert len(logits) == found
             assert bool(faint.any())
             # What windows and views go by.
             assert len(scene.stored_with_pending(active.geometry.block)) == found
@@ -108,12 +108,12 @@ def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, 
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
     coordinator = make(**LONG, coarse_model=len(start), coarse_gaussians=most, density=GROWING)
     train(coordinator, photos, steps=29)
-    live = len(coordinator.params["means"])
-    assert live == coordinator.count()
-    assert live == most if most == 125 else live > 125 if most else live <= len(start)
+    active = len(coordinator.params["means"])
+    assert active == coordinator.count()
+    assert active == most if most == 125 else active > 125 if most else active <= len(start)
     train(coordinator, photos, steps=1)
     assert coordinator.state.active is None
-    assert coordinator.count() == live
+    assert coordinator.count() == active
     assert coordinator.scene.clocks(0).refined > 0
 
 

@@ -42,7 +42,7 @@ def disk(scene) -> Disk:
 
 
 def persist(scene: StoredScene, step: int, *blocks: int, within: float = PATIENCE) -> None:
-    """Put blocks to rest, each with one Gaussian fewer."""
+    """Persist blocks, each with one Gaussian fewer."""
     fewer = {block: BlockState.fresh(scene.state(block).gaussians[1:]) for block in blocks}
     scene.persist(scene.tree, fewer, {"step": step}, within=within)
 
@@ -126,7 +126,7 @@ def test_what_waits_never_takes_more_ram_than_there_is(scene, disk):
     assert disk.commits == [({0, 1}, {"step": 2})]
 
 
-def test_a_large_live_block_is_written_beside_the_training_and_no_second_copy_is_made(scene, disk):
+def test_a_large_active_block_is_written_beside_the_training_and_no_second_copy_is_made(scene, disk):
     scene.ram_bytes = 1
     disk.free.clear()
     scene.persist(scene.tree, {ACTIVE: scene.state(0)}, {"step": 1}, within=SOON)

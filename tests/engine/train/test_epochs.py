@@ -128,9 +128,9 @@ def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make,
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:
         train_step(coordinator, photos)
-        active, live = coordinator.state.active, coordinator.visit.block
+        active, block = coordinator.state.active, coordinator.visit.block
         if active is not None and not active.is_whole:
-            counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
+            counts[block.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(block))
     assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
     assert [len(found) for found in counts[False].values()] == [1, 1]
 

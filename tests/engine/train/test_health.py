@@ -81,8 +81,8 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     assert repaired == [("moments", 1, block), ("values", 1, block)]
     assert bool((squares[0] == 0).all())
     assert torch.equal(squares[1], kept)
-    live = coordinator.scene.gaussians(block)
-    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in live.items())
+    after = coordinator.scene.gaussians(block)
+    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in after.items())
     moments = coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"]
     assert bool((moments[4] == 0).all())
     assert bool((moments[5] != 0).any())
@@ -143,9 +143,9 @@ def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
     """A wall of one colour may be one oversized Gaussian."""
     coordinator = make(blocks=1, steps=40, warmup=0.0, density=STILL)
     train(coordinator, photos, steps=12)
-    live = coordinator.visit.block
-    live.growth = {"weight": torch.zeros(len(live)), "passes": torch.ones(len(live))}
-    live.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
+    block = coordinator.visit.block
+    block.growth = {"weight": torch.zeros(len(block)), "passes": torch.ones(len(block))}
+    block.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
     with torch.no_grad():
         coordinator.params["scales"][:2] = 5.0
     train_step(coordinator, photos)

@@ -22,7 +22,7 @@ def highest_of(coordinator) -> int:
     return int(degrees_in_use([whole_scene(coordinator).features_rest]).max())
 
 
-def test_what_is_live_has_no_more_harmonics_than_are_in_use(make, photos, start):
+def test_what_is_active_has_no_more_harmonics_than_are_in_use(make, photos, start):
     coordinator, found = make(block_limit=ROOMY, **LATE), set()
     while not coordinator.finished:
         train_step(coordinator, photos)

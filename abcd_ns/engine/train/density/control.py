@@ -131,7 +131,7 @@ class DensityClock:
 
 
 class DensityControl:
-    """Applies the configured strategy to the live block."""
+    """Applies the configured strategy to the active block."""
 
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
         self.config, self._axes = config, primitive.axes

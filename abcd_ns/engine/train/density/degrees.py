@@ -66,7 +66,7 @@ def are_gone(
 def lower(
     params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
-    """Let harmonics of the live block go that do not pay, with their moments; see `lowered`.
+    """Let harmonics of the active block go that do not pay, with their moments; see `lowered`.
 
     Returns:
         The block's statistics from now on.
