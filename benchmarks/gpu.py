@@ -94,7 +94,7 @@ TINY = Size(("splatfacto",), (2,), 2.0, 4, (2,), 200, 0, (2,), 2.0, 2)
 class ScoredJob(Job):
     """A run of which nothing is wanted but its scores."""
 
-    scratch = (STATE, CHECKPOINTS)  # blocks at rest, layers, checkpoints: gigabytes
+    scratch = (STATE, CHECKPOINTS)  # stored blocks, layers, checkpoints: gigabytes
 
 
 def build(_args: Args, _work: Path) -> Iterator[Found]:

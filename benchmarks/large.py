@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Loaded
 from abcd_ns.engine.render import CutShot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -54,7 +54,7 @@ PITCH, HALF = 72.0, 26.0
 EYE = 2.0
 """Height of the cameras, metres."""
 CACHED = 32
-"""Blocks that have room in RAM at rest."""
+"""Stored blocks that have room in RAM."""
 PARAMETERS = 236
 """Bytes of a Gaussian."""
 STAGES = ("plan", "reading", "loading", "drawing", "folding, and Python", "steps", "commit")
@@ -201,7 +201,7 @@ def begin(town: Town, folder: Path, start: Start | None = None) -> Coordinator:
     names = [Path(str(view.index)) for view in views]
     args = town.args
     capture = Capture(views, names, lambda _: None, town.gaussians, town.blocks * args.gaussians)
-    live, budget = nothing_live(3), Budget(steps=10**7)
+    empty, budget = nothing_active(3), Budget(steps=10**7)
     run = (
         options(town.blocks, town.args),
         capture,
@@ -209,7 +209,7 @@ def begin(town: Town, folder: Path, start: Start | None = None) -> Coordinator:
         folder,
         budget,
         Small(args.modelled / args.width),
-        *live,
+        *empty,
     )
     return begin_run(*run, lambda _: None, None, start)
 

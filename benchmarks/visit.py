@@ -16,7 +16,7 @@ import torch
 import tyro
 from torch.profiler import ProfilerActivity
 
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.train import visit_training
@@ -65,8 +65,8 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     options = RunOptions(TrainingConfig(seed=args.seed), blocks=blocks, workers=1)
     rasterizer, budget = make_rasterizer("auto", device), Budget(seconds=args.seconds)
-    live, store, trained_on = nothing_live(3, device), folder / "store", capture.capture(3)
-    return begin_run(options, trained_on, device, store, budget, rasterizer, *live, say=lambda _: None)
+    empty, store, trained_on = nothing_active(3, device), folder / "store", capture.capture(3)
+    return begin_run(options, trained_on, device, store, budget, rasterizer, *empty, say=lambda _: None)
 
 
 def run(
@@ -84,7 +84,7 @@ def run(
     coordinator = begin(capture, blocks, args, folder)
     clock, views = StageClock(), 0
     scene = coordinator.scene
-    scene.rest = clock.timed("commit", scene.rest)  # as far as the training waits for it
+    scene.persist = clock.timed("commit", scene.persist)  # as far as the training waits for it
     visit_training.layers_of_visit = clock.timed("layers", layers_of_visit)
     while not coordinator.finished:
         if coordinator.progress < 0.5:

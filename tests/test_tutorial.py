@@ -27,7 +27,7 @@ def memory_table() -> str:
 
 
 def test_what_a_gaussian_takes_is_what_the_reference_says():
-    takes = [DeviceNeeds(1, batch=1, waiting=3, live_degree=degree).gaussian_bytes for degree in (0, 3)]
+    takes = [DeviceNeeds(1, batch=1, waiting=3, active_degree=degree).gaussian_bytes for degree in (0, 3)]
     assert "takes {:,} bytes instead of {:,}".format(*takes) in REFERENCE.read_text().replace("\n", " ")
     assert f"up to {takes[1] / takes[0]:.1f} times as many" in TUTORIAL.read_text().replace("\n", " ")
 

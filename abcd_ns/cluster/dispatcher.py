@@ -32,7 +32,7 @@ from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost,
 from abcd_ns.engine.store.assigned_scene import Outlines
 from abcd_ns.engine.store.commit import commit, with_pending
 from abcd_ns.engine.store.special_blocks import DEFERRED
-from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
+from abcd_ns.engine.train.coordinator import Coordinator, persist_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import BlocksBusyError
@@ -263,13 +263,13 @@ class Dispatcher(Coordinator):
         state.health[block] = outcome.health
         active.layer_seconds = outcome.layer_seconds
         updates = commit(self.scene, block, outcome.state, self.config.recipe.migrate, visit.taken)
-        rest_after_visit(self.run, active, outcome.state, updates, epoch)
+        persist_after_visit(self.run, active, outcome.state, updates, epoch)
         queued = state.epoch == epoch and state.queue
         if not queued and all(other.assignment.task.epoch != epoch for other in self._in_flight):
             self.announce(EpochEnded(epoch, state.step))
         return True
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     def restore(self) -> None:
         """As the coordinator's; what workers are at is dropped, and planned again."""

@@ -96,7 +96,7 @@ class ForkedWorkers(Workers):
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
-        return lambda: value  # a fork has it, too, and what is at rest never changes
+        return lambda: value  # a fork has it, too, and what is stored never changes
 
     def submit(self, assignment: Assignment) -> None:
         member = self._longest_idle()

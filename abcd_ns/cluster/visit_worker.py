@@ -62,10 +62,10 @@ class OnAssignment(Visits):
 
     def room(self) -> int | None:
         """What the block's limit, and its part of the scene's, leave."""
-        config, live = self._run.config, len(self._run.params["means"])
-        left = 0 if self._task.allowance is None else self._task.allowance - (live - self._begun)
+        config, gaussians = self._run.config, len(self._run.params["means"])
+        left = 0 if self._task.allowance is None else self._task.allowance - (gaussians - self._begun)
         limit = self._run.limits.of_block(self._task.tree.num_blocks)
-        return config.room((config.density.limit or 0) - left, live, limit)
+        return config.room((config.density.limit or 0) - left, gaussians, limit)
 
 
 class VisitWorker:

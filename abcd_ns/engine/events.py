@@ -41,7 +41,7 @@ class StepTaken:
 
 @dataclass(frozen=True)
 class VisitEnded:
-    """The block is at rest; it is on disk TrainingConfig.commit_seconds later at most."""
+    """The block is persisted; it is on disk TrainingConfig.commit_seconds later at most."""
 
     visit: int
     epoch: int

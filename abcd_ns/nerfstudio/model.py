@@ -1,4 +1,4 @@
-"""Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
+"""Splatfacto's model around the engine: the active block in training, the merged scene for other tools."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.gaussians.block_state import checksum
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Ownership, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, fog_in_white, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
@@ -69,7 +69,7 @@ class AbcdModelConfig(SplatfactoModelConfig):
 class AbcdModel(SplatfactoModel):
     """Draws batches for training and whole pictures for evaluation, viewer and export.
 
-    While training, the registered parameters are the live block alone and the rest of the scene is reached
+    While training, the registered parameters are the active block alone and the rest of the scene is reached
     through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene,
     on the device or, where that has no room to draw it at once, on the CPU. `state_dict` gives the merged
     scene in either case.
@@ -99,7 +99,7 @@ class AbcdModel(SplatfactoModel):
         self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
 
     def follow(self, coordinator: Trainer) -> None:
-        """From now on the scene is the coordinator's, and the registered parameters its live block."""
+        """From now on the scene is the coordinator's, and the registered parameters its active block."""
         self._coordinator, self._parted = coordinator, None
 
     def draws_with(self) -> Rasterizer:
@@ -132,7 +132,7 @@ class AbcdModel(SplatfactoModel):
         return self.features_dc
 
     def scene(self) -> BlockScene:
-        """The whole scene by blocks, the live one included."""
+        """The whole scene by blocks, the active one included."""
         if self._coordinator is not None:
             return self._coordinator.scene
         means, tree = self.gauss_params["means"], self.tree
@@ -144,13 +144,13 @@ class AbcdModel(SplatfactoModel):
         """The whole scene in one list, without a graph; while training, on a device. Not a property: it may
         read everything from disk."""
         if self._coordinator is None:
-            return live_gaussians(self.gauss_params).detach()
+            return active_gaussians(self.gauss_params).detach()
         return self._coordinator.scene.everything(device)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """The merged scene under splatfacto's names, whatever is live."""
+        """The merged scene under splatfacto's names, whatever is active."""
         state = super().state_dict(*args, **kwargs)
         if self._coordinator is not None:
             prefix, merged = kwargs.get("prefix", ""), self.merged()
@@ -172,7 +172,7 @@ class AbcdModel(SplatfactoModel):
         for name, value in list(self.gauss_params.items()):
             self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
         super(SplatfactoModel, self).load_state_dict(state, **kwargs)  # splatfacto's takes all to the device
-        if expected is not None and checksum(live_gaussians(self.gauss_params)) != expected:
+        if expected is not None and checksum(active_gaussians(self.gauss_params)) != expected:
             raise UserError(
                 "This checkpoint is damaged: the checksum of its Gaussians is wrong. Go on with the run by "
                 "`ns-train --load-dir`, which saves another, or take an older one."
@@ -301,7 +301,7 @@ class AbcdModel(SplatfactoModel):
     ) -> viewed.BlockPictures:
         """Draws the scene by parts: of Gaussians what `keep` gives, or those in the crop box."""
         whole = self.scene()
-        if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
+        if isinstance(whole, StoredScene) and whole.is_active_as_a_whole:
             whole = MemoryScene(whole.tree, self.merged())  # or nobody knows which block holds how many
         shown = keep or self._crop
         scene = ChangedScene(whole, lambda _, found: shown(found))

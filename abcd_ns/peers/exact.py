@@ -75,7 +75,7 @@ class ExactTrainer(Trainer):
     """Every step trains all blocks.
 
     `render` gives pictures whose gradient the caller's backward takes; `after_step` hands it on to blocks.
-    Between steps no Gaussians are live, so that the caller's optimizers have nothing to step.
+    Between steps the run's parameters are empty, so that the caller's optimizers have nothing to step.
     """
 
     def __init__(self, run: TrainingRun) -> None:
@@ -88,7 +88,7 @@ class ExactTrainer(Trainer):
         self._residuals: list[Float[Tensor, "_h _w 3"]] = []
         self._pictures: list[Tensor] = []
         self._take()
-        self.scene.set_live(None, lambda: self._all.gaussians)
+        self.scene.set_active(None, lambda: self._all.gaussians)
 
     @property
     def batch(self) -> int:
@@ -157,7 +157,7 @@ class ExactTrainer(Trainer):
         if self.finished:
             self.save()
         elif self.scene.is_due(self.config.commit_seconds):
-            self.rest(self.config.commit_seconds)
+            self.persist(self.config.commit_seconds)
 
     def gradients(self) -> Gradients:
         """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given."""
@@ -177,11 +177,11 @@ class ExactTrainer(Trainer):
         """Gaussians in the whole scene."""
         return len(self._all)
 
-    def rest(self, within: float) -> None:
-        """Put every block to rest; there are no visits."""
+    def persist(self, within: float) -> None:
+        """Persist every block; there are no visits."""
         held, nobody = split_by_block(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
-        self.run.rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
+        self.run.persist(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
     def restore(self) -> None:
         """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""

@@ -28,13 +28,13 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.initialize import PointCloud
 from abcd_ns.engine.gaussians.packed import Packed
-from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -57,9 +57,9 @@ explain. Behind it, or the ray misses the cell: the block must let all light thr
 lies behind the surface, and nobody can tell what is there."""
 
 
-def independent_at_rest(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[BlockName, Packed]]:
+def independent_blocks(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[BlockName, Packed]]:
     """The first content of a store: every block, and once more every block as it began."""
-    for block, content in blocks_at_rest(tree, start):
+    for block, content in stored_blocks(tree, start):
         yield from ((block, content), (initial_of(block), content))
 
 
@@ -124,7 +124,7 @@ class BlocksAlone(Visits):
         self._looked_at: int | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
-        """The next block's one visit; the block is put to rest as it begins, with what lies around it."""
+        """The next block's one visit; the block is persisted as it begins, with what lies around it."""
         run, state = self._run, self._run.state
         began, since = run.stopwatch.seconds, run.progress
         if not state.views:
@@ -145,7 +145,7 @@ class BlocksAlone(Visits):
             until=since + (1 - since) * share if plans else 1.0,
         )
         state.visit += 1
-        run.rest(self._scene.tree, {block: self._joined(block)}, run.config.commit_seconds)
+        run.persist(self._scene.tree, {block: self._joined(block)}, run.config.commit_seconds)
         return state.active
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:
@@ -157,8 +157,8 @@ class BlocksAlone(Visits):
         cell = self._scene.tree.cell(block)
 
         def inside() -> Gaussians:
-            live = live_gaussians(params)
-            return live[cell.contains(live.means)]
+            gaussians = active_gaussians(params)
+            return gaussians[cell.contains(gaussians.means)]
 
         return inside
 

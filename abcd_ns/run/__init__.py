@@ -3,4 +3,4 @@
 STATE = "abcd"
 """The folder of a run that holds all that is ours; `ns-train` has `nerfstudio_models` beside it."""
 STORE = "store"
-"""The blocks at rest, in STATE."""
+"""The stored blocks, in STATE."""

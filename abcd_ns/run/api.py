@@ -13,7 +13,7 @@ from torch import Tensor
 
 from abcd_ns.cluster.forked_workers import can_fork
 from abcd_ns.engine.events import Event
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.render import PrimitiveName, make_rasterizer
 from abcd_ns.engine.render.rasterization import rasterizer_on
@@ -91,10 +91,10 @@ def train(
     first = partial(cloud_of, places, colors, views, training)
     capture = Capture(views, names, target, first, len(places))
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
-    live, budget = nothing_live(training.sh_degree, device), Budget(steps, options.max_seconds)
+    empty, budget = nothing_active(training.sh_degree, device), Budget(steps, options.max_seconds)
     threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
     try:
-        trainer = begin_run(options, capture, device, folder, budget, rasterizer, *live, LOG.info)
+        trainer = begin_run(options, capture, device, folder, budget, rasterizer, *empty, LOG.info)
         with closing(trainer):
             if listener is not None:
                 trainer.announce.subscribe(listener)

@@ -1,4 +1,4 @@
-"""How a run begins or resumes: its blocks at rest, what fits on the device, and what trains it."""
+"""How a run begins or resumes: its stored blocks, what fits on the device, and what trains it."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,11 +20,11 @@ from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.splitting import cut_at_rest
+from abcd_ns.engine.train.density.splitting import cut_stored
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size
 from abcd_ns.engine.train.run import TrainingRun
@@ -34,7 +34,7 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
-from abcd_ns.peers.independent import independent_at_rest, independent_trainer
+from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from abcd_ns.run.fit import (
     COARSE_MODEL,
     FITTED,
@@ -143,7 +143,7 @@ def begin_run(
             fitted |= _fit(options, capture, device, device_bytes, there, blocks).limits
         training = replace(training, limits=replace(training.limits, **fitted))
         if start is not None:
-            cut_at_rest(scene, RunState.from_json(store.state), training.limits)
+            cut_stored(scene, RunState.from_json(store.state), training.limits)
         views = capture.views
         run = TrainingRun(training, budget, scene, views, rasterizer, params, optimizers, device=device)
         trainer = _trainer_of(run, options, capture, device_bytes, remote)
@@ -214,7 +214,7 @@ def _coarse_model_size(
     return coarse_model_size(training, largest, 0 if options.gaussian_bytes else capture.pixels)
 
 
-# -- at rest -------------------------------------------------------------------------------------------
+# -- the store -----------------------------------------------------------------------------------------
 
 
 def _new_store(
@@ -243,9 +243,9 @@ def _new_store(
     header = {"tree": tree.to_json(), **fitted, COARSE_MODEL: keep or 0, ASKED: options.blocks}
     store = ParameterStore.create(folder, {**header, **made_for.header()})
     if training.recipe.overlap > 0:
-        content = independent_at_rest(tree, cloud)
+        content = independent_blocks(tree, cloud)
     else:
-        content = blocks_at_rest(tree, cloud, room=keep, seed=training.seed)
+        content = stored_blocks(tree, cloud, room=keep, seed=training.seed)
     del cloud  # it goes as soon as it is parted
     store.commit(content)
     return store

@@ -55,7 +55,7 @@ BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64
 """No larger factor is proposed."""
 BLOCKS_EACH = 2
-"""Blocks for each worker at least, where their number is not given: one in training, one that rests."""
+"""Blocks for each worker at least, where their number is not given: one in training, one stored."""
 
 
 @dataclass(frozen=True)

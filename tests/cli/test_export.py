@@ -15,7 +15,7 @@ from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
@@ -44,7 +44,7 @@ def write_run(folder, scene, **header):
     tree = build_kd(scene.means, BLOCKS)
     folder.mkdir()
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
-        store.commit(blocks_at_rest(tree, scene), state=RunState().to_json())
+        store.commit(stored_blocks(tree, scene), state=RunState().to_json())
     matrix = torch.cat((FRAME.rotation, FRAME.translation[:, None]), dim=1)
     (folder / TRANSFORMS).write_text(json.dumps({"transform": matrix.tolist(), "scale": FRAME.scale}))
     return folder

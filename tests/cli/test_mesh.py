@@ -26,7 +26,7 @@ from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import Gaussians
@@ -166,7 +166,7 @@ def write_run(place: Path, **header: Any) -> Path:
     wall = Frame(matrix[:, :3], matrix[:, 3], known["scale"]).gaussians(surface_of(means, 0.05, colors))
     tree = build_kd(wall.means, 2)
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
-        store.commit(blocks_at_rest(tree, wall), state=RunState().to_json())
+        store.commit(stored_blocks(tree, wall), state=RunState().to_json())
     return folder
 
 

@@ -16,7 +16,7 @@ class InProcessWorkers(Workers):
         self._worker = worker
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
-        return lambda: value  # what is at rest never changes
+        return lambda: value  # what is stored never changes
 
     def submit(self, assignment: Assignment) -> None:
         self._longest_idle().take(assignment)

@@ -12,7 +12,7 @@ import torch
 from abcd_ns.engine.events import Repaired, StepTaken, VisitEnded
 from abcd_ns.engine.render import loss
 from abcd_ns.engine.render.cuda import pairs as gsplat_pairs
-from abcd_ns.engine.store.special_blocks import LIVE
+from abcd_ns.engine.store.special_blocks import ACTIVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import (
@@ -185,7 +185,7 @@ def test_the_loss_is_the_cpus(device, size):
 def test_what_is_saved_in_the_midst_of_a_visit_is_not_pinned(tmp_path, begin, photos):
     coordinator = begin(tmp_path, blocks=1)
     train(coordinator, photos, steps=3)
-    coordinator.rest(600.0)
-    tensors = coordinator.scene._unsaved[LIVE].tensors.values()
+    coordinator.persist(600.0)
+    tensors = coordinator.scene._unsaved[ACTIVE].tensors.values()
     assert not any(tensor.is_pinned() for tensor in tensors)
     coordinator.close()

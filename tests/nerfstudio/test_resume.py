@@ -178,7 +178,7 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
     ("where", "words"),
     [
         ("nerfstudio.trainer.inspect", "Stopped before anything was written."),
-        ("run.begin.blocks_at_rest", "Stopped before training began."),
+        ("run.begin.stored_blocks", "Stopped before training began."),
     ],
 )
 def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(

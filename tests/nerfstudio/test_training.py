@@ -113,7 +113,7 @@ def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
     tree = BlockTree.from_json(store.header["tree"])
     scene = StoredScene(tree, store)
-    in_store = torch.cat([scene.gaussians_at_rest(block).means for block in range(tree.num_blocks)])
+    in_store = torch.cat([scene.stored_with_pending(block).means for block in range(tree.num_blocks)])
     special = [other for other in store.blocks if isinstance(other, str) and other != PENDING]
     assert all(store.counts(other) == 0 for other in special)
     assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
@@ -181,12 +181,12 @@ def test_the_other_methods_train_and_load(data, tmp_path, method):
     assert np.isfinite(pipeline.get_average_eval_image_metrics()["psnr"])
 
 
-def test_while_training_only_the_live_block_is_registered(data, tmp_path):
+def test_while_training_only_the_active_block_is_registered(data, tmp_path):
     config = configure(data, tmp_path)
     config.pipeline.training.warmup = 0.0
     pipeline = run(config, stop_after=2).pipeline
-    live = [p.shape[0] for n, p in pipeline.model.named_parameters() if n.endswith("means")]
-    assert 0 < sum(live) < pipeline.coordinator.count()
+    active = [p.shape[0] for n, p in pipeline.model.named_parameters() if n.endswith("means")]
+    assert 0 < sum(active) < pipeline.coordinator.count()
 
 
 def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, capsys):

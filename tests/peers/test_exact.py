@@ -7,7 +7,7 @@ import torch
 
 from abcd_ns.engine.gaussians.param_swap import rates_of_under_trained
 from abcd_ns.engine.layers.compositing import composite
-from abcd_ns.engine.store.special_blocks import LIVE
+from abcd_ns.engine.store.special_blocks import ACTIVE
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
@@ -151,7 +151,7 @@ def test_views_of_a_step_may_differ_in_size(exact):
         coordinator = exact(kind.__name__, views=views, kind=kind, **options)
         train_step(coordinator, photos)
         coordinator.save()
-        state = coordinator.scene.state(0 if kind is ExactTrainer else LIVE)
+        state = coordinator.scene.state(0 if kind is ExactTrainer else ACTIVE)
         counted.append(state.growth)
     exactly, jointly = counted
     assert torch.allclose(exactly["worth"], jointly["worth"], rtol=1e-3, atol=1e-4)

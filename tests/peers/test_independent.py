@@ -8,7 +8,7 @@ import torch
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_at_rest, independent_trainer
+from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_blocks, independent_trainer
 from tests.reference.scenes import (
     GROWING,
     STILL,
@@ -22,7 +22,7 @@ from tests.reference.scenes import (
 def independent(make):
     """Makes such runs."""
     given = {"overlap": 0.2, "layers": False, "migrate": False, "blocks": 4}
-    given |= {"kind": independent_trainer, "content": independent_at_rest}
+    given |= {"kind": independent_trainer, "content": independent_blocks}
     return lambda *args, **options: make(*args, **{**given, **options})
 
 

@@ -14,11 +14,11 @@ import torch
 
 from abcd_ns import methods
 from abcd_ns.engine.events import Event, StepTaken
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
-from abcd_ns.peers.independent import independent_at_rest, independent_trainer
+from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
 CURVES = Path(__file__).with_suffix(".json")
@@ -47,11 +47,11 @@ def curve_of(method: str, folder: Path) -> dict[str, list[float]]:
     photos = Photos(random_gaussians(150, seed=7, size=0.12), views)
     start = random_gaussians(120, seed=1, size=0.12)
     options = options_of(method)
-    kind, content = None, blocks_at_rest
+    kind, content = None, stored_blocks
     if options["exact"]:
         kind = ExactTrainer
     elif options["overlap"] > 0:
-        kind, content = independent_trainer, independent_at_rest
+        kind, content = independent_trainer, independent_blocks
     blocks = 1 if method == "abcd_monolithic" else BLOCKS
     if blocks > 1 and options.get("warmup", 1) > 0:
         options["coarse_model"] = COARSE_MODEL

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -19,7 +19,7 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest, pack_points
+from abcd_ns.engine.store.coarse_model import pack_points, stored_blocks
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.config import TrainingConfig
@@ -102,7 +102,7 @@ def make_coordinator(
     resume: bool = False,
     coarse_model: int | None = None,
     kind: Callable[[TrainingRun], Trainer] | None = None,
-    content: Callable = blocks_at_rest,
+    content: Callable = stored_blocks,
     ram_bytes: int = 2 << 30,
     layer_bytes: int = LAYER_BYTES,
     layer_ram_bytes: int = 0,
@@ -134,7 +134,7 @@ def make_coordinator(
         StoredScene(tree, store, ram_bytes),
         views,
         rasterizer or TorchRasterizer(primitive=config.primitive),
-        *nothing_live(gaussians.sh_degree, device),
+        *nothing_active(gaussians.sh_degree, device),
         device=device,
     )
     room = LayerRoom(layer_bytes, layer_ram_bytes)

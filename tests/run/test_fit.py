@@ -39,7 +39,7 @@ def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = Non
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
     waiting, degree = 0 if blocks == 1 else 3, 3 - fit.late_harmonics
     options = {"crop_pixels": fit.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
-    return DeviceNeeds(pixels, 1, **options, live_degree=degree)
+    return DeviceNeeds(pixels, 1, **options, active_degree=degree)
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
@@ -117,7 +117,7 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
     assert training.growing_degree == 3 - fit.late_harmonics < 3
     for degree in range(training.growing_degree + 1, 4):
         few = limits_at(training, degree).of_block(blocks)
-        needs = dataclasses.replace(growing, live_degree=degree)
+        needs = dataclasses.replace(growing, active_degree=degree)
         assert needs.bytes_for(few) <= growing.bytes_for(most) < needs.bytes_for(few + 2)
         assert degree_with_room(training, int(FULL * few), blocks, FULL) == degree
         assert degree_with_room(training, int(FULL * few) + 1, blocks, FULL) == degree - 1

@@ -13,7 +13,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
-from abcd_ns.peers.independent import independent_at_rest, independent_trainer
+from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from tests.reference.scenes import STILL, listen, stop, whole_scene
 from tests.reference.simulated_device import DEVICE
 
@@ -28,13 +28,13 @@ def target(photos):
 
 
 def assert_on_device(coordinator) -> None:
-    """The live block is all there: parameters, moments, and Adam's steps."""
+    """The active block is all there: parameters, moments, and Adam's steps."""
     for name, parameter in coordinator.params.items():
         state = coordinator.optimizers[name].state[parameter]
         assert {parameter.device, *(state[key].device for key in ("step", *MOMENTS))} == {DEVICE}
 
 
-APART = {"kind": independent_trainer, "content": independent_at_rest, "layers": False, "migrate": False}
+APART = {"kind": independent_trainer, "content": independent_blocks, "layers": False, "migrate": False}
 
 
 @pytest.mark.parametrize(

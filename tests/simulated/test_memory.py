@@ -77,7 +77,7 @@ def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, batch, given):
     )
     primitive = given.get("primitive", "3dgs")
     degree = 3 - given.get("late_harmonics", 0)
-    needs = DeviceNeeds(32**2, batch, levels=0, primitive=primitive, live_degree=degree)
+    needs = DeviceNeeds(32**2, batch, levels=0, primitive=primitive, active_degree=degree)
     model = needs.gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)
 

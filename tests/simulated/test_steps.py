@@ -161,7 +161,7 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(on_device, photos):
     assert bool(moved.any())
     assert [(event.what, event.count) for event in told] == [("gradients", 1)] * 2
     train(coordinator, photos, steps=4)
-    assert bool(coordinator.visit.live.growth["worth"].isfinite().all())
+    assert bool(coordinator.visit.block.growth["worth"].isfinite().all())
     train(coordinator, photos)
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
 

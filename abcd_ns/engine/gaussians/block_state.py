@@ -32,7 +32,7 @@ class Clocks:
 
 @dataclass(frozen=True)
 class BlockState:
-    """One block at rest. Rows of every tensor belong to the same Gaussians."""
+    """One block, as stored. Rows of every tensor belong to the same Gaussians."""
 
     gaussians: Gaussians
     exp_avg: Gaussians

@@ -1,4 +1,4 @@
-"""Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
+"""Puts a block into active parameters and Adam optimizers, and takes it out again, moments included."""
 
 import math
 from collections.abc import Mapping, MutableMapping
@@ -14,7 +14,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 Params = MutableMapping[str, Parameter] | ParameterDict
-"""The live parameters by name."""
+"""The active parameters by name."""
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """One Adam per parameter, under the parameter's name; each with one parameter group."""
 LEARNING_RATES = {
@@ -38,9 +38,9 @@ STEP_PARTS = 128
 
 
 def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: int = 1) -> None:
-    """Make `state` the live block: new Parameters, with its moments as Adam's state.
+    """Make `state` the active block: new Parameters, with its moments as Adam's state.
 
-    The Parameters that were live before lose their memory at once, even where something (a logged loss,
+    The Parameters that were active before lose their memory at once, even where something (a logged loss,
     say) still refers to them.
 
     Args:
@@ -59,7 +59,7 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
 
 
 def raise_degree(params: Params, optimizers: Optimizers, sh_degree: int) -> None:
-    """Give the live block room for spherical harmonics of this degree, which begin as zeros; none go."""
+    """Give the active block room for spherical harmonics of this degree, which begin as zeros; none go."""
     name = "features_rest"
     before, more = params[name], (sh_degree + 1) ** 2 - 1 - params[name].shape[1]
     if more <= 0:
@@ -74,10 +74,10 @@ def raise_degree(params: Params, optimizers: Optimizers, sh_degree: int) -> None
 
 
 def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
-    """The live block as a BlockState on the CPU that shares no memory with later steps; it stays live.
+    """The active block as a BlockState on the CPU, which shares no memory with later steps. It stays active.
 
-    From a GPU up to PINNED_BYTES of the copies are in pinned memory, which is not for keeping: what is put to
-    rest is copied once more.
+    From a GPU up to PINNED_BYTES of the copies are in pinned memory. That is not for keeping: what is
+    persisted is copied once more.
 
     Args:
         growth: the strategy's statistics, each [n]; copied.
@@ -112,12 +112,12 @@ def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
     return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)
 
 
-def live_gaussians(params: Params) -> Gaussians:
-    """The live parameters as Gaussians, with their gradients' graph."""
+def active_gaussians(params: Params) -> Gaussians:
+    """The active parameters as Gaussians, with their gradients' graph."""
     return Gaussians(**{name: params[name] for name in PARAM_NAMES})
 
 
-def nothing_live(
+def nothing_active(
     sh_degree: int, device: torch.device | str = "cpu"
 ) -> tuple[dict[str, Parameter], Optimizers]:
     """Empty parameters and one Adam for each, as 3DGS uses it: for a coordinator that nerfstudio does not

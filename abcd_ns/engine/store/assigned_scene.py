@@ -40,12 +40,12 @@ class AssignedScene(VisitScene):
         self.tree = tree
         self._outlines, self._block, self._state = outlines, block, state
         self._drawn, self._read = drawn, dict[int, Gaussians]()
-        self._live: Callable[[], Gaussians] | None = None
+        self._active: Callable[[], Gaussians] | None = None
 
     # What only the active block is asked for is of the assigned one, as its visit found it.
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
-        self._live = live
+    def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
+        self._active = gaussians
 
     def state(self, name: BlockName) -> BlockState:  # noqa: ARG002
         return self._state
@@ -56,12 +56,12 @@ class AssignedScene(VisitScene):
     def rows(self, name: BlockName) -> int:
         return len(self.state(name))
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
+    def stored_with_pending(self, block: int) -> Gaussians:
         return self.state(block).gaussians
 
     def gaussians(self, block: int) -> Gaussians:
         if block == self._block:
-            return self._state.gaussians if self._live is None else self._live().detach()
+            return self._state.gaussians if self._active is None else self._active().detach()
         return self._read_as_drawn(block)
 
     def as_drawn(self) -> Gaussians:
@@ -74,8 +74,8 @@ class AssignedScene(VisitScene):
         return self._read[block]
 
     def count(self, block: int) -> int:
-        is_live = block == self._block and self._live is not None
-        return len(self._live()) if is_live else self._outlines.counts[block]
+        is_active = block == self._block and self._active is not None
+        return len(self._active()) if is_active else self._outlines.counts[block]
 
     def bounds(self, block: int) -> Box | None:
         return self._outlines.bounds[block]

@@ -21,7 +21,7 @@ class BlockMemory:
         return sum(block.nbytes for kept in (self._drawn, self._training) for block in kept.values())
 
     def drawn(self, name: BlockName) -> Packed | None:
-        """What others draw of a block at rest, or will, if it is here."""
+        """What others draw of a stored block, or will, if it is here."""
         return _used(self._drawn, name)
 
     def whole(self, name: BlockName) -> Packed | None:

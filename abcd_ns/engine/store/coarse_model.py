@@ -52,7 +52,7 @@ def by_block(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[i
         yield block, BlockState.fresh(part if isinstance(part, Gaussians) else part.gaussians())
 
 
-def blocks_at_rest(
+def stored_blocks(
     tree: BlockTree, start: Gaussians | PointCloud, room: int | None = None, seed: int = 0
 ) -> Iterator[tuple[BlockName, Packed]]:
     """The first content of a store: `start` parted by `tree`, nothing trained yet; one block at a time.

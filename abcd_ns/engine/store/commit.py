@@ -1,4 +1,4 @@
-"""Where the Gaussians of a visit come to rest, on the CPU: in their block, or pending for another."""
+"""Where the Gaussians of a visit are stored, on the CPU: in their block, or pending for another."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -11,7 +11,7 @@ from abcd_ns.engine.gaussians.initialize import PointCloud
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.store.coarse_model import by_block, defer, pack_points, split_by_block
 from abcd_ns.engine.store.scene import StoredScene, VisitScene
-from abcd_ns.engine.store.special_blocks import DEFERRED, LIVE, PENDING, WHOLE, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, DEFERRED, PENDING, WHOLE, BlockName
 
 
 def state_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) -> BlockState:
@@ -21,7 +21,7 @@ def state_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) ->
         saved: the visit goes on where a save found it.
     """
     state = (
-        scene.state(LIVE)
+        scene.state(ACTIVE)
         if saved
         else join([with_pending(scene, number) for number in _blocks(scene, block)])
     )
@@ -31,7 +31,7 @@ def state_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) ->
 def rows_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) -> int:
     """Rows of `state_for_visit`, without reading them."""
     if saved:
-        return scene.rows(LIVE)
+        return scene.rows(ACTIVE)
     return sum(scene.rows(number) + len(scene.pending_for(number) or ()) for number in _blocks(scene, block))
 
 
@@ -40,7 +40,7 @@ def _blocks(scene: VisitScene, block: BlockName) -> range:
 
 
 def with_pending(scene: VisitScene, block: int) -> BlockState:
-    """A block at rest, joined by those that wait for its next visit."""
+    """A stored block, joined by those that wait for its next visit."""
     state, migrants = scene.state(block), scene.pending_for(block)
     return state if migrants is None else join([state, migrants])
 

@@ -1,4 +1,4 @@
-"""Where the blocks of a scene are to be found: at rest in RAM and on disk, one of them live in parameters."""
+"""Where the blocks of a scene are found: stored in RAM and on disk, one of them active in parameters."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.coarse_model import split_by_block
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import Gaussians
 
@@ -54,22 +54,22 @@ class VisitScene(BlockScene, Protocol):
     """What a visit needs to know of the scene that its block belongs to."""
 
     def state(self, name: BlockName) -> BlockState:
-        """A block at rest and whole, without its pending migrants."""
+        """A stored block, whole, without its pending migrants."""
 
     def pending_for(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
 
     def rows(self, name: BlockName) -> int:
-        """Gaussians at rest under a name, the pending migrants of a block left out; nothing is read."""
+        """Gaussians stored under a name, the pending migrants of a block left out; nothing is read."""
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
-        """The block as a visit will find it, whatever is live."""
+    def stored_with_pending(self, block: int) -> Gaussians:
+        """The block as a visit will find it, whatever is active."""
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
-        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest.
+    def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+        """From now on `block`, or with None the whole scene, is what `gaussians` returns, not what is stored.
 
         Args:
-            sh_degree: of the scene's harmonics, of which what is live may have fewer by now.
+            sh_degree: of the scene's harmonics, of which what is active may have fewer by now.
         """
 
 
@@ -100,7 +100,7 @@ class MemoryScene(BlockScene):
 
 
 class StoredScene(VisitScene):
-    """A scene at rest in a ParameterStore, read block by block, with the live block laid over it.
+    """A scene in a ParameterStore, read block by block, with the active block laid over it.
 
     Blocks that were read stay in RAM, least recently used first out, within `ram_bytes`.
     """
@@ -116,8 +116,8 @@ class StoredScene(VisitScene):
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[BlockName, tuple[int, Box | None]] = {}
         self._stored_bounds: dict[BlockName, Box | None] = {}
-        self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
-        self._rested = time.monotonic()
+        self._active: tuple[int | None, Callable[[], Gaussians]] | None = None
+        self._persisted = time.monotonic()
         self._pending_by_block: dict[int, BlockState] = {}
         self.pending: BlockState | None = None
         """All Gaussians that wait for their blocks' visits, in the order in which they came."""
@@ -125,7 +125,7 @@ class StoredScene(VisitScene):
 
     # -- changes -------------------------------------------------------------------------------------
 
-    def rest(
+    def persist(
         self,
         tree: BlockTree,
         blocks: Mapping[BlockName, BlockState | Packed],
@@ -138,12 +138,12 @@ class StoredScene(VisitScene):
             blocks: on the CPU, by number or special name, and tables of the run's under names of their own;
                 they belong to the scene from now on, as `state` does.
             within: this is written so many seconds after the last write began. With 0 all is durable when
-                this returns, and also where what waits to be written exceeds `ram_bytes`, but for a live
-                block: training goes on while that is written.
+                this returns, and also where what waits to be written exceeds `ram_bytes`. Not for an
+                active block: training goes on while that is written.
 
         Raises:
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
-                written by the next `rest` or `flush`.
+                written by the next `persist` or `flush`.
         """
         packed = {n: block if isinstance(block, Packed) else block.packed() for n, block in blocks.items()}
         with self._writer.mutex:
@@ -158,10 +158,10 @@ class StoredScene(VisitScene):
                 self._sort(blocks.get(PENDING, self.pending))
             unsaved = self.unsaved_bytes  # under the lock: the writer takes out what it has written
             self._memory.shrink(unsaved)
-            self._rested = time.monotonic()
+            self._persisted = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
-        live = blocks.get(LIVE)
-        if within <= 0 or (unsaved > self.ram_bytes and not live):
+        active = blocks.get(ACTIVE)
+        if within <= 0 or (unsaved > self.ram_bytes and not active):
             self.flush()
         self._writer.check()
 
@@ -188,12 +188,12 @@ class StoredScene(VisitScene):
             self._memory.shrink(self.unsaved_bytes)
 
     def is_due(self, within: float) -> bool:
-        """Whether something should be put to rest again: nothing was for so many seconds, and nothing is
-        being written, so that RAM holds one copy of a large live block; 0 is no limit."""
-        return 0 < within <= time.monotonic() - self._rested and not self._writer.busy
+        """Whether to persist again: nothing was for so many seconds, and nothing is being written. So RAM
+        holds one copy of a large active block. 0 is no limit."""
+        return 0 < within <= time.monotonic() - self._persisted and not self._writer.busy
 
     def flush(self) -> None:
-        """Return when all that was put to rest is durable; what failed before is tried again. See `rest`."""
+        """Return when all that was persisted is durable; what failed before is tried again. See `persist`."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -203,23 +203,23 @@ class StoredScene(VisitScene):
         finally:
             self.store.close()
 
-    def set_live(self, block: int | None, live: Callable[[], Gaussians], sh_degree: int = 0) -> None:
-        self._live, self._sh_degree = (block, live), sh_degree
+    def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:
+        self._active, self._sh_degree = (block, gaussians), sh_degree
 
-    def clear_live(self) -> None:
-        """No block is live any more."""
-        self._live = None
+    def clear_active(self) -> None:
+        """No block is active any more."""
+        self._active = None
 
     # -- what is there -------------------------------------------------------------------------------
 
     @property
-    def is_live_as_a_whole(self) -> bool:
-        """Whether all blocks are live, and `count` is right in sum alone."""
-        return self._live is not None and self._live[0] is None
+    def is_active_as_a_whole(self) -> bool:
+        """Whether all blocks are active, and `count` is right in sum alone."""
+        return self._active is not None and self._active[0] is None
 
-    def _is_live(self, block: int) -> bool:
+    def _is_active(self, block: int) -> bool:
         """Whether the block is, or all of them are."""
-        return self._live is not None and self._live[0] in (None, block)
+        return self._active is not None and self._active[0] in (None, block)
 
     def has(self, name: BlockName) -> bool:
         """Whether there is such a block, or anything under such a special name."""
@@ -230,7 +230,7 @@ class StoredScene(VisitScene):
         return self.store.counts(name) if block is None else block.rows
 
     def clocks(self, name: BlockName) -> Clocks:
-        """How far a block had come when it was put to rest; nothing is read."""
+        """How far a block had come when it was persisted; nothing is read."""
         return BlockState.clocks_of(self._meta(name))
 
     def _meta(self, name: BlockName) -> dict[str, Any]:
@@ -241,11 +241,11 @@ class StoredScene(VisitScene):
         return self._pending_by_block.get(block)
 
     def state(self, name: BlockName) -> BlockState:
-        """A block, or what is kept under a special name, at rest and whole, without its pending migrants."""
+        """A block, or what is stored under a special name: whole, without its pending migrants."""
         return BlockState.unpacked(self._packed(name, whole=True))
 
     def _packed(self, name: BlockName, *, whole: bool) -> Packed:
-        """What is at rest under a name, or what others draw of it; in RAM from now on."""
+        """What is stored under a name, or what others draw of it; in RAM from now on."""
         with self._writer.mutex:
             if name in self._unsaved:
                 return self._unsaved[name]
@@ -257,7 +257,7 @@ class StoredScene(VisitScene):
             return found
 
     def table(self, name: str) -> Packed | None:
-        """A table of the run's, at rest; None where there is none of this name."""
+        """A stored table of the run's; None where there is none of this name."""
         if not self.has(name):
             return None
         return self._unsaved.get(name) or Packed(*self.store.load(name))
@@ -273,18 +273,18 @@ class StoredScene(VisitScene):
             self._packed(block, whole=True)
 
     def gaussians(self, block: int) -> Gaussians:
-        if not self._is_live(block):
+        if not self._is_active(block):
             return self.drawn(block, "cpu")
-        live = self._all_live()
-        return live[self.tree.assign(live.means) == block] if self.is_live_as_a_whole else live
+        active = self._all_active()
+        return active[self.tree.assign(active.means) == block] if self.is_active_as_a_whole else active
 
-    def _all_live(self) -> Gaussians:
-        live = self._live[1]().detach()
-        return live.of_degree(max(self._sh_degree, live.sh_degree))
+    def _all_active(self) -> Gaussians:
+        active = self._active[1]().detach()
+        return active.of_degree(max(self._sh_degree, active.sh_degree))
 
     def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
-        """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
-        if self._is_live(block):
+        """As for any scene; what is stored is cut while it is packed, and unpacked on the device."""
+        if self._is_active(block):
             return super().drawn(block, device, which)
         packed, migrants = self._packed(block, whole=False), self.pending_for(block)
         rows = ~packed.tensors[IS_DEFERRED]  # they are not to be seen before the block's next visit
@@ -297,17 +297,17 @@ class StoredScene(VisitScene):
 
     def everything(self, device: torch.device | str) -> Gaussians:
         """All blocks, one after the other."""
-        if self.is_live_as_a_whole:  # who lives where is asked once
-            live = self._all_live()
-            return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
+        if self.is_active_as_a_whole:  # who lives where is asked once
+            active = self._all_active()
+            return active[self.tree.assign(active.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
 
-    def gaussians_at_rest(self, block: int) -> Gaussians:
+    def stored_with_pending(self, block: int) -> Gaussians:
         stored, migrants = self.stored(block), self.pending_for(block)
         return stored if migrants is None else Gaussians.cat([stored, migrants.gaussians])
 
     def stored(self, name: BlockName) -> Gaussians:
-        """What is at rest under a name, without pending migrants; deferred points included."""
+        """What is stored under a name, without pending migrants; deferred points included."""
         return self._packed(name, whole=False).gaussians()
 
     @property
@@ -317,7 +317,7 @@ class StoredScene(VisitScene):
 
     @property
     def cached_bytes(self) -> int:
-        """RAM that blocks at rest take."""
+        """RAM that stored blocks take."""
         with self._writer.mutex:
             return self._memory.nbytes + self.unsaved_bytes
 
@@ -326,28 +326,28 @@ class StoredScene(VisitScene):
         return self._versions.get(block, 0)
 
     def count(self, block: int) -> int:
-        if not self._is_live(block):
+        if not self._is_active(block):
             return self.rows(block) + len(self.pending_for(block) or ())
         # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
-        return 0 if self.is_live_as_a_whole and block > 0 else len(self._live[1]())
+        return 0 if self.is_active_as_a_whole and block > 0 else len(self._active[1]())
 
     def parameters(self) -> int:
-        """Of how many numbers all Gaussians are, what is live included; harmonics count up to the degree of
+        """Of how many numbers all Gaussians are, what is active included; harmonics count up to the degree of
         each."""
-        counted = 0 if self._live is None else count_parameters(self._live[1]().features_rest.detach())
+        counted = 0 if self._active is None else count_parameters(self._active[1]().features_rest.detach())
         for block in range(self.tree.num_blocks):
-            if not self._is_live(block):
+            if not self._is_active(block):
                 migrants = self.pending_for(block)
                 counted += self._meta(block)["parameters"]
                 counted += 0 if migrants is None else count_parameters(migrants.gaussians.features_rest)
         return counted
 
     def bounds(self, block: int) -> Box | None:
-        if self._is_live(block):
+        if self._is_active(block):
             return bounds_of(self.gaussians(block))
         version = self.version(block)
         if block not in self._bounds or self._bounds[block][0] != version:
-            with self._writer.mutex:  # it may come to rest meanwhile
+            with self._writer.mutex:  # it may be persisted meanwhile
                 if block not in self._stored_bounds:
                     self._stored_bounds[block] = bounds_of(self.stored(block))
                 migrants, box = self.pending_for(block), self._stored_bounds[block]

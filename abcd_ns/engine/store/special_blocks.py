@@ -12,7 +12,7 @@ WHOLE = "whole"
 """All blocks at once, where a visit names its block; nothing is stored under it."""
 DEFERRED = "deferred"
 """Deferred points: Gaussians that join at the end of the warm-up."""
-LIVE = "live"
+ACTIVE = "live"  # its name in stores
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
 PENDING = "pending"

@@ -1,7 +1,7 @@
 """Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
 
-`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not live lies at rest in
-the store; listeners are told what happens.
+`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not active is stored.
+Listeners are told what happens.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from abcd_ns.engine.events import EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.commit import commit
-from abcd_ns.engine.store.special_blocks import LIVE, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, BlockName
 from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Planner, Visits
@@ -30,7 +30,7 @@ from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 
 AT_ONCE = 1e-3
-"""Seconds: what a long visit puts to rest is written as soon as no other write is under way. The last one may
+"""Seconds: what a long visit persists is written as soon as no other write is under way. The last one may
 have begun just now with a state of long ago; to count from that, a kill would lose twice `commit_seconds`."""
 
 
@@ -80,7 +80,7 @@ class Coordinator(Trainer):
         return self.visit.next_batch()
 
     def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in the live parameters."""
+        """Draw the active block between its layers; differentiable in its parameters."""
         return self.visit.render(batch)
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
@@ -99,12 +99,12 @@ class Coordinator(Trainer):
         if self.visit.is_over:
             self.end_visit()
         elif self.scene.is_due(self.config.commit_seconds):
-            self.rest(AT_ONCE)
+            self.persist(AT_ONCE)
 
     @property
     def finished(self) -> bool:
-        """Whether the budget is used up, and nothing is live: seconds may run out just after a visit was
-        found not to be over, and then it takes one more step."""
+        """Whether the budget is used up, and no block is active. Seconds may run out just after a visit was
+        found not to be over; then it takes one more step."""
         return self.state.active is None and super().finished
 
     # -- a visit -------------------------------------------------------------------------------------
@@ -119,19 +119,19 @@ class Coordinator(Trainer):
             self.scene.read_ahead(plan.block)
 
     def end_visit(self) -> None:
-        """Put the block to rest, and what left it into pending migrants; cut what has outgrown a block."""
+        """Persist the block, and what left it as pending migrants; cut what has outgrown a block."""
         active = self.run.active
         state = self.visit.finish()
         if active.is_whole:
             self._end_warm_up()
-        self.visit.live.let_go()  # a worker, or the next footprints, may need the device's memory
+        self.visit.block.let_go()  # a worker, or the next footprints, may need the device's memory
         updates = commit(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
-            updates[LIVE] = state.nobody
-        self.scene.clear_live()
+            updates[ACTIVE] = state.nobody
+        self.scene.clear_active()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
-        rest_after_visit(self.run, active, state, updates, self.state.epoch)
+        persist_after_visit(self.run, active, state, updates, self.state.epoch)
         if not active.is_whole and not self.state.queue:
             self.announce(EpochEnded(self.state.epoch, self.state.step))
 
@@ -149,18 +149,18 @@ class Coordinator(Trainer):
             return
         self._final_pruning.run()
         self.state.pruned_at = self.state.step
-        self.run.rest(self.scene.tree, {}, 0.0)
+        self.run.persist(self.scene.tree, {}, 0.0)
 
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
-        self.visit.influence = None  # it holds on to what was live
+        self.visit.influence = None  # it holds on to what was active
         others = influence_on(
-            self.run, live_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
+            self.run, active_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
         )
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     @property
     def layer_limit(self) -> int:
@@ -172,19 +172,19 @@ class Coordinator(Trainer):
         """Bytes that the layers of the visit that is under way take."""
         return self.visit.layers.nbytes if self.visit.layers else 0
 
-    def rest(self, within: float) -> None:
-        """Put the live block to rest under a name of its own, and the run's state."""
+    def persist(self, within: float) -> None:
+        """Persist the active block under a name of its own, and the run's state."""
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
-            updates = {LIVE: self.visit.live.detached().unpinned()}
+            updates = {ACTIVE: self.visit.block.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()
-        self.run.rest(self.scene.tree, updates, within)
+        self.run.persist(self.scene.tree, updates, within)
 
     def restore(self) -> None:
-        """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
+        """Go on from the store's newest generation: where `save` was called, or something was persisted."""
         self.run.restore()
         if self.state.active is not None:
             self.visit.attach(self.state.active)
@@ -202,20 +202,20 @@ def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Ite
     return influence(whole, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
 
 
-def rest_after_visit(
+def persist_after_visit(
     run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
 ) -> None:
-    """Put what a visit changed to rest, blocks that have outgrown their limit in parts, and tell listeners.
+    """Persist what a visit changed, blocks that have outgrown their limit in parts, and tell listeners.
 
     Args:
         state: what the visit made of its block.
-        updates: what comes to rest of it.
+        updates: what is persisted of it.
         epoch: that it belongs to.
     """
     tree, parts = cut_full(run.scene, updates, run.state, run.limits, run.announce)
     if active.is_joint and tree.num_blocks > 1:
         run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
-    run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
+    run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])
     run.announce(

@@ -21,7 +21,7 @@ class BlockHealth:
     moments: int = 0
     """Rows of Adam's moments likewise."""
     values: int = 0
-    """Gaussians that were no numbers: put back as they were at rest or, where that is not known, replaced by
+    """Gaussians that were no numbers: put back as they were stored or, where that is not known, replaced by
     transparent ones."""
     oversized: int = 0
     """Gaussians that were shrunk."""

@@ -44,7 +44,7 @@ def layers_of_visit(
         renderer_of(run, run.scene),
         LayerStore(run.device, room.device, room.ram),
         active.geometry,
-        run.scene.gaussians_at_rest(active.geometry.block),
+        run.scene.stored_with_pending(active.geometry.block),
         run.views,
         RenderSettings(active.sh_degree, config.antialiased),
         window_weight=config.recipe.window_weight,

@@ -38,8 +38,8 @@ LAYER_SHARE = 1 / 8
 """Of the device's budget, for the layers of a visit."""
 PHOTO_SHARE = 1 / 8
 """Of the device's budget, for photos that are kept there."""
-LIVE_COPIES = 5
-"""Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
+ACTIVE_COPIES = 5
+"""Of each value while a block is active: the parameter, its gradient, two moments, and the stored block."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class DeviceNeeds:
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
         primitive: what a Gaussian is.
-        live_degree: of harmonics of a live block; None for `sh_degree`, that of the scene.
+        active_degree: of harmonics of an active block; None for `sh_degree`, that of the scene.
     """
 
     pixels: int
@@ -67,12 +67,12 @@ class DeviceNeeds:
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
     waiting: int = 0
-    live_degree: int | None = None
+    active_degree: int | None = None
 
     @property
     def parameter_bytes(self) -> int:
-        """Of one Gaussian's parameters, while it is live."""
-        return parameter_bytes(self.sh_degree if self.live_degree is None else self.live_degree)
+        """Of one Gaussian's parameters, while it is active."""
+        return parameter_bytes(self.sh_degree if self.active_degree is None else self.active_degree)
 
     @property
     def gaussian_bytes(self) -> int:
@@ -103,10 +103,10 @@ class DeviceNeeds:
         pixels = max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT
         return pixels + LEAST_PASS * frozen + DEVICE_SPLATS * drawn
 
-    def frozen_beside(self, live: int) -> int:
-        """Frozen Gaussians that a pass may draw beside so many live ones: in the room that these have for
+    def frozen_beside(self, active: int) -> int:
+        """Frozen Gaussians that a pass may draw beside so many active ones. Their room is what these have for
         gradients and for their own drawings, which have not begun."""
-        free = live * (self.gaussian_bytes - 3 * self.parameter_bytes)
+        free = active * (self.gaussian_bytes - 3 * self.parameter_bytes)
         return free // drawing_bytes(self.sh_degree, self.primitive)
 
     @property
@@ -157,7 +157,7 @@ def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | 
     """What a visit takes in a run on images of so many pixels at most, in one block or several.
 
     Args:
-        sh_degree: of the live block; None for the one that limits count on.
+        sh_degree: of the active block; None for the one that limits count on.
     """
     return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
@@ -169,7 +169,7 @@ def needs_of_step(
     limits = config.limits
     at_once, crop = min(views, limits.batch_limit or views), limits.crop_pixels
     sh_degree = config.growing_degree if sh_degree is None else sh_degree
-    options = {"primitive": config.primitive, "waiting": views - at_once, "live_degree": sh_degree}
+    options = {"primitive": config.primitive, "waiting": views - at_once, "active_degree": sh_degree}
     return DeviceNeeds(pixels, at_once, config.sh_degree, crop, **options)
 
 
@@ -218,9 +218,9 @@ def parameter_bytes(sh_degree: int) -> int:
     return FLOAT * (NUMBERS_WITHOUT_COLOR + 3 * (sh_degree + 1) ** 2)
 
 
-def live_bytes(gaussians: int, sh_degree: int) -> int:
-    """What a live block of so many Gaussians takes, pictures not counted."""
-    return gaussians * parameter_bytes(sh_degree) * LIVE_COPIES
+def active_bytes(gaussians: int, sh_degree: int) -> int:
+    """What an active block of so many Gaussians takes, pictures not counted."""
+    return gaussians * parameter_bytes(sh_degree) * ACTIVE_COPIES
 
 
 def projected_bytes(primitive: PrimitiveName) -> int:
@@ -255,7 +255,7 @@ def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
     Raises:
         OutOfRoomError: the memory that is free does not suffice; says what would.
     """
-    needed, free = live_bytes(gaussians, sh_degree), free_bytes(device)
+    needed, free = active_bytes(gaussians, sh_degree), free_bytes(device)
     if needed > free:
         raise OutOfRoomError(
             f"A block of {gaussians:,} Gaussians takes {bytes_in_words(needed)}, but {device} has "

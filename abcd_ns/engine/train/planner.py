@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
 from abcd_ns.engine.space.influence import overlaps, worth_training
@@ -59,9 +59,9 @@ class Visits(Protocol):
         """
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
-        """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile: all
-        that is live."""
-        return lambda: live_gaussians(params)
+        """Its block is active, at the visit's beginning or after a resume. What others see of it meanwhile:
+        all that is active."""
+        return lambda: active_gaussians(params)
 
     def room(self) -> int | None:
         """Gaussians that may be added to the block; None for any number."""
@@ -111,12 +111,12 @@ class Planner(Visits):
 
     def room(self) -> int | None:
         """What the limits of scene and block leave; in the warm-up what the memory of a visit holds."""
-        run, live = self._run, len(self._run.params["means"])
+        run, gaussians = self._run, len(self._run.params["means"])
         if run.active.is_whole:
             deferred, limit = self._scene.rows(DEFERRED), self._config.density.limit
             most = self._config.limits.coarse_gaussians
-            return (most if limit is None else min(most, limit - deferred)) - live
-        return self._config.room(run.count(), live, run.limits.of_block(run.blocks))
+            return (most if limit is None else min(most, limit - deferred)) - gaussians
+        return self._config.room(run.count(), gaussians, run.limits.of_block(run.blocks))
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the coarse model of all blocks is trained."""
@@ -255,7 +255,7 @@ class Planner(Visits):
         """Of MANY views, those in which a mean of the block's lies, as far as SAMPLE tell; of fewer, none."""
         if len(views) <= MANY:
             return ()
-        means = self._scene.gaussians_at_rest(block).means
+        means = self._scene.stored_with_pending(block).means
         found, _, inner, _ = self._culling
         rows = [row for row, view in enumerate(found) if view in views]
         points = in_float64(means[:: -(-len(means) // SAMPLE)]).cpu()
@@ -284,5 +284,5 @@ class Planner(Visits):
     def _footprints(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
         if not views:
             return VisitGeometry(block, {})
-        gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
+        gaussians = self._scene.stored_with_pending(block).to(self._run.device)
         return footprints(gaussians, block, views.values(), self._run.rasterizer, share)

@@ -1,4 +1,4 @@
-"""What all parts of a training share: options, the scene at rest, live parameters, where the run stands."""
+"""What all parts of a training share: options, the stored scene, active parameters, where the run stands."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -27,7 +27,7 @@ from abcd_ns.engine.types import View
 
 
 class TrainingRun:
-    """One training run over a scene, through the caller's live parameters and optimizers.
+    """One training run over a scene, through the caller's parameters and optimizers.
 
     Args:
         views: the training views; `View.index` names them.
@@ -145,15 +145,15 @@ class TrainingRun:
         return self.state.active
 
     def count(self) -> int:
-        """Gaussians in the whole scene, the live block included."""
+        """Gaussians in the whole scene, the active block included."""
         return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
 
-    def rest(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
-        """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
+    def persist(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
+        """Persist blocks and the run's state, as one snapshot; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
         self.state.poses = self.poses.to_json()
         tables = self.light.changed() if self.light is not None else {}
-        self.scene.rest(tree, {**updates, **tables}, self.state.to_json(), within)
+        self.scene.persist(tree, {**updates, **tables}, self.state.to_json(), within)
 
     def restore(self) -> None:
         """Stand where the store's newest generation stands."""

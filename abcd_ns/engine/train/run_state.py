@@ -71,7 +71,7 @@ class ActiveVisit:
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
     saved: bool = False
-    """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
+    """Whether the active block was persisted in the middle of the visit, see special_blocks.ACTIVE."""
     batch: int = 0
     """Views in each of its steps; 0 for as many as steps have at most."""
     layer_seconds: float = 0.0
@@ -139,7 +139,7 @@ class RunState:
     influence: Influence = field(default_factory=dict)
     """As far as known; blocks that are missing are trained on all views that see them."""
     poses: dict[str, str] = field(default_factory=dict)
-    """See Poses, at rest; empty where all are as they were given."""
+    """See Poses, as stored; empty where all are as they were given."""
     uses: float = 0.0
     """Of each view by the whole scene, so far; counted where poses are refined. A block is its part of it."""
     posed: float = 0.0

@@ -124,28 +124,28 @@ class Trainer(ABC):
         return 0
 
     def count(self) -> int:
-        """Gaussians in the whole scene, what is live included."""
+        """Gaussians in the whole scene, what is active included."""
         return self.run.count()
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     @abstractmethod
-    def rest(self, within: float) -> None:
-        """Put what is live to rest, and the run's state; on disk within so many seconds."""
+    def persist(self, within: float) -> None:
+        """Persist what is active, and the run's state; on disk within so many seconds."""
 
     def save(self, pin: str | None = None) -> None:
-        """Commit everything, what is live included.
+        """Commit everything, what is active included.
 
         Args:
             pin: keep this state under a name until it is unpinned.
         """
-        self.rest(0.0)
+        self.persist(0.0)
         if pin is not None:
             self.scene.store.pin(pin)
 
     @abstractmethod
     def restore(self) -> None:
-        """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
+        """Go on from the store's newest generation: where `save` was called, or something was persisted."""
 
     def close(self) -> None:
         """Write what waits to be written, and let go of the store, as `StoredScene.close`."""

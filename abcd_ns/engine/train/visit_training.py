@@ -8,7 +8,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted, StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import Pace, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Pace, active_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
@@ -53,7 +53,7 @@ class VisitTraining:
 
     def __init__(self, run: TrainingRun, visits: Visits, room: LayerRoom) -> None:
         self.run, self._visits, self._room = run, visits, room
-        self.live = ActiveBlock(run)
+        self.block = ActiveBlock(run)
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
@@ -73,14 +73,13 @@ class VisitTraining:
         return most if active is None else active.batch or most
 
     def attach(self, active: ActiveVisit) -> None:
-        """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
-        found it."""
+        """Make the visit's block active and draw its layers, at its beginning or where a save found it."""
         run, state = self.run, self.run.state
-        self.live.attach(active, self.batch, max(active.sh_degree, self.degree))
+        self.block.attach(active, self.batch, max(active.sh_degree, self.degree))
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
         self._reach = run.reach(active.trained_on)
-        run.scene.set_live(block, self._visits.attached(active, run.params), run.config.sh_degree)
-        gaussians, self.influence = len(self.live), None
+        run.scene.set_active(block, self._visits.attached(active, run.params), run.config.sh_degree)
+        gaussians, self.influence = len(self.block), None
         if active.is_whole:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
         run.announce(VisitBegan(active.number, state.epoch, block, active.steps, seen, gaussians))
@@ -95,10 +94,10 @@ class VisitTraining:
 
     def _shown_in(self, views: Sequence[int]) -> dict[int, float]:
         """The influence that the block has on each of these views by now."""
-        run, shown, live = self.run, {}, live_gaussians(self.run.params)
+        run, shown, gaussians = self.run, {}, active_gaussians(self.run.params)
         for view in views:
             seen, options = self.whole(view), {"antialiased": run.config.antialiased}
-            shown[view] = share_shown(live, run.rasterizer, seen.shot, seen.in_front, **options)
+            shown[view] = share_shown(gaussians, run.rasterizer, seen.shot, seen.in_front, **options)
         return shown
 
     # -- a step --------------------------------------------------------------------------------------
@@ -108,11 +107,11 @@ class VisitTraining:
         come, too."""
         run = self.run
         if run.active.is_alone:
-            self.live.raise_degree(self.degree)
+            self.block.raise_degree(self.degree)
         decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
-        decays = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)
-        trained = self.live.clocks.adam_views
+        decays = run.config.recipe.fast_start and (run.active.is_joint or self.block.clocks.visits > 0)
+        trained = self.block.clocks.adam_views
         damping = final_decay(run.progress, trained) if decays else 1.0
         self._pace.set(self.batch, trained, decay, damping)
         step, first = run.state.step, run.active.done * self.batch
@@ -123,7 +122,7 @@ class VisitTraining:
         return Batch(step, samples, run.config.limits.batch_limit)
 
     def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in the live parameters."""
+        """Draw the active block between its layers; differentiable in its parameters."""
         rendered = self._rendered = self._draw(batch.samples)
         if not self.run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
@@ -157,12 +156,12 @@ class VisitTraining:
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(errors)
-        self.live.count_step(self.batch, taken)
-        clock = self.live.density_clock(taken, self.batch, self._visits.room())
+        self.block.count_step(self.batch, taken)
+        clock = self.block.density_clock(taken, self.batch, self._visits.room())
         judged = self._residuals.found()
-        self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
+        self.block.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
-            self.live.prune()
+            self.block.prune()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
@@ -192,7 +191,7 @@ class VisitTraining:
         """Whether the visit has had all its steps or time, or its block has outgrown the device."""
         run, active = self.run, self.run.active
         out_of_time = run.progress >= min(active.until, 1.0)
-        return active.done >= active.steps or out_of_time or self._is_warm or self.live.has_outgrown
+        return active.done >= active.steps or out_of_time or self._is_warm or self.block.has_outgrown
 
     @property
     def _is_warm(self) -> bool:
@@ -205,10 +204,10 @@ class VisitTraining:
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
-        if not active.is_all and not self.live.is_new:
-            self.live.prune()
-        self.live.end_visit(counts=not active.is_whole)
-        state = self.run.health.end_visit(self.live.detached)
+        if not active.is_all and not self.block.is_new:
+            self.block.prune()
+        self.block.end_visit(counts=not active.is_whole)
+        state = self.run.health.end_visit(self.block.detached)
         self.layers = None
         return state
 
@@ -249,14 +248,14 @@ class VisitTraining:
         return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
 
     def _draw(self, samples: Sequence[Sample]) -> Rendered:
-        run, live = self.run, live_gaussians(self.run.params)
+        run, gaussians = self.run, active_gaussians(self.run.params)
         rasters = run.rasterizer.draw(
-            live,
+            gaussians,
             [sample.shot for sample in samples],
-            sh_degree=min(self.degree, live.sh_degree),  # by time, it may have risen since `next_batch`
+            sh_degree=min(self.degree, gaussians.sh_degree),  # by time, it may have risen since `next_batch`
             antialiased=run.config.antialiased,
             blend_weights=run.density.wants_weights,
-            residual_sums=run.density.asks(run.share, first=self.live.clocks.visits == 0),
+            residual_sums=run.density.asks(run.share, first=self.block.clocks.visits == 0),
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         views = tuple(sample.view for sample in samples)

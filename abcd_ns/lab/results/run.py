@@ -70,7 +70,7 @@ class Run:
     peak_rss_bytes: int
     """The most RAM that the process held until the end of training, the curve's evaluations included."""
     store_bytes: int
-    """On disk: the blocks at rest, with their optimiser state."""
+    """On disk: the stored blocks, with their optimiser state."""
     layer_seconds: float
     """Training time that went into drawing layers."""
     curve: tuple[CurvePoint, ...]

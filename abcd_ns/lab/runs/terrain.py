@@ -11,7 +11,7 @@ import torch
 
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.render import Rasterizer, loss, make_rasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -86,7 +86,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
 
 
 def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
-    """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
+    """The land, stored tile by tile, or all tiles as one block, which takes the RAM that it takes."""
     whole, tiles = job.method == "abcd-monolithic", range(land.tiles)
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
@@ -109,8 +109,8 @@ def _coordinator(
         background="black",
         density=DensityConfig(strategy="off"),  # or blocks would not be equal
     )
-    live, budget = nothing_live(3, device), Budget(steps=10**9)
-    return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *live, device=device))
+    empty, budget = nothing_active(3, device), Budget(steps=10**9)
+    return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *empty, device=device))
 
 
 def _train(

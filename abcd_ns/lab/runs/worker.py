@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer
 from PIL import Image
 
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.layers.layer_renderer import default_pass
 from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, needs_of_step
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
@@ -142,14 +142,14 @@ class Training:
             drawing: layers are about to be drawn, and steps have not begun.
         """
         coordinator = self.coordinator
-        config, live = coordinator.config, len(coordinator.params["means"])
-        degree = live_gaussians(coordinator.params).sh_degree
+        config, gaussians = coordinator.config, len(coordinator.params["means"])
+        degree = active_gaussians(coordinator.params).sh_degree
         needs = needs_of_step(config, 0, coordinator.batch, degree)
-        held = live * needs.gaussian_bytes
+        held = gaussians * needs.gaussian_bytes
         if drawing:  # parameters and their moments, and of others so many as one pass draws
             most = config.limits.pass_gaussians or default_pass(coordinator.scene)
-            frozen = min(most, coordinator.count() - live) if config.recipe.layers else 0
-            held = live * 3 * needs.parameter_bytes
+            frozen = min(most, coordinator.count() - gaussians) if config.recipe.layers else 0
+            held = gaussians * 3 * needs.parameter_bytes
             held += frozen * drawing_bytes(config.sh_degree, config.primitive)
         self.gaussian_bytes = max(self.gaussian_bytes, held)
 
@@ -214,7 +214,7 @@ def file_bytes(training: Training) -> dict[str, int | None]:
         return {}
     model = training.pipeline.model
     ours = isinstance(model, AbcdModel)
-    scene = model.merged() if ours else live_gaussians(model.gauss_params).detach().to("cpu")
+    scene = model.merged() if ours else active_gaussians(model.gauss_params).detach().to("cpu")
     return {"ply_bytes": ply_bytes(scene), "spz_bytes": spz_bytes(scene)}
 
 

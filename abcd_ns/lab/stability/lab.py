@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
-from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.space.distances import as_trained
@@ -131,9 +131,9 @@ class Lab:
         blocks = 1 if method == "abcd-monolithic" else blocks
         options = RunOptions(config, blocks=blocks, partition=partition, workers=1)
         folder = Path(tempfile.mkdtemp(dir=self._folder)) / STORE
-        live = nothing_live(SH_DEGREE)
+        empty = nothing_active(SH_DEGREE)
         capture, steps, device = stage.capture(SH_DEGREE), Budget(steps=budget), torch.device("cpu")
-        return begin_run(options, capture, device, folder, steps, self.rasterizer, *live, say=lambda _: None)
+        return begin_run(options, capture, device, folder, steps, self.rasterizer, *empty, say=lambda _: None)
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.

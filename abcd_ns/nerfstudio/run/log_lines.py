@@ -57,7 +57,7 @@ class SampleLine(Line):
 
 @dataclass(frozen=True)
 class VisitEndLine(Line):
-    """A visit ended and its block is at rest."""
+    """A visit ended and its block is persisted."""
 
     visit: int
     epoch: int

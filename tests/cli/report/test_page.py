@@ -19,7 +19,7 @@ from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import RunState
 from tests.cli.report.runs import (
@@ -237,6 +237,6 @@ def test_a_run_is_read_while_it_commits(tmp_path):
     tree = build_kd(scene.means, 2)
     folder = made_up_folder(tmp_path / "run")
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
-        store.commit(blocks_at_rest(tree, scene), state=RunState(views={0: 4, 1: 4}).to_json())
+        store.commit(stored_blocks(tree, scene), state=RunState(views={0: 4, 1: 4}).to_json())
         found = open_run(folder)
     assert found.state.views == {0: 4, 1: 4}

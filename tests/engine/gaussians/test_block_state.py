@@ -1,4 +1,4 @@
-"""Blocks at rest, and swapping them into live parameters and Adam."""
+"""Stored blocks, and swapping them into active parameters and Adam."""
 
 import copy
 from dataclasses import replace
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
-from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, nothing_live
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, nothing_active
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import random_gaussians
 
@@ -31,8 +31,8 @@ def assert_same(a: BlockState, b: BlockState) -> None:
         assert torch.equal(value, theirs[0][name]), name
 
 
-def live(state: BlockState):
-    params, optimizers = nothing_live(1)
+def active(state: BlockState):
+    params, optimizers = nothing_active(1)
     attach(state, params, optimizers)
     return params, optimizers
 
@@ -66,23 +66,23 @@ def test_tensors_of_unequal_length_are_refused():
         BlockState(random_gaussians(3), random_gaussians(2), random_gaussians(3))
 
 
-def test_a_block_that_rested_trains_as_if_it_had_not():
+def test_a_block_that_was_persisted_trains_as_if_it_had_not():
     state = some_state(6)
-    stayed = live(state)
+    stayed = active(state)
     take_steps(*stayed, 5)
-    moved = live(state)
+    moved = active(state)
     take_steps(*moved, 2)
     clocks = replace(state.clocks, adam_views=state.clocks.adam_views + 2)
-    rest = detach(*moved, state.growth, clocks)
+    stored = detach(*moved, state.growth, clocks)
     attach(some_state(4, seed=9), *moved)
     take_steps(*moved, 3)
-    attach(rest, *moved)
+    attach(stored, *moved)
     take_steps(*moved, 3)
     assert_same(detach(*moved, state.growth, state.clocks), detach(*stayed, state.growth, state.clocks))
 
 
 def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():
-    params, optimizers = live(some_state(6))
+    params, optimizers = active(some_state(6))
     kept = copy.copy(params)
     take_steps(params, optimizers, 1)
     attach(some_state(3, seed=5), params, optimizers)
@@ -92,8 +92,8 @@ def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():
 
 def test_detached_tensors_do_not_follow_later_steps():
     state = some_state(6)
-    params, optimizers = live(state)
-    rest = detach(params, optimizers, state.growth, state.clocks)
+    params, optimizers = active(state)
+    stored = detach(params, optimizers, state.growth, state.clocks)
     take_steps(params, optimizers, 1)
-    assert_same(rest, state)
-    assert not torch.equal(live_gaussians(params).means, rest.gaussians.means)
+    assert_same(stored, state)
+    assert not torch.equal(active_gaussians(params).means, stored.gaussians.means)

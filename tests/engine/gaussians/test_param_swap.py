@@ -14,7 +14,7 @@ from abcd_ns.engine.gaussians.param_swap import (
     adam_step,
     attach,
     detach,
-    nothing_live,
+    nothing_active,
 )
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
@@ -22,7 +22,7 @@ from tests.reference.scenes import random_gaussians
 
 def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
-    params, adam = nothing_live(sh_degree=1)
+    params, adam = nothing_active(sh_degree=1)
     attach(BlockState.fresh(random_gaussians(1)), params, adam)
     pace, before = (
         Pace(adam, fast_start=False),
@@ -46,7 +46,7 @@ def test_views_that_agree_come_as_far_together_as_one_by_one(views):
     ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 2, 4), (2_000, 4, 4), (10_000, 1, 1)]
 )
 def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
-    _, adam = nothing_live(sh_degree=0)
+    _, adam = nothing_active(sh_degree=0)
     given = {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES}
     Pace(adam, fast_start=True).set(batch, views, means_decay=0.5)
     expected = {name: times * rate * (0.5 if name == "means" else 1.0) for name, rate in given.items()}
@@ -69,18 +69,18 @@ def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
     Args:
         batches: (views in a step, steps); the block is taken out and put back in between.
     """
-    params, adam = nothing_live(sh_degree=0)
-    pace, rest = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
+    params, adam = nothing_active(sh_degree=0)
+    pace, stored = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
     for batch, steps in batches:
-        attach(rest, params, adam, batch=batch)
-        clocks = rest.clocks
+        attach(stored, params, adam, batch=batch)
+        clocks = stored.clocks
         for _ in range(steps):
             pace.set(batch, 0, means_decay=1.0)
             params["scales"].grad = torch.ones_like(params["scales"])
             adam["scales"].step()
             clocks = replace(clocks, adam_views=clocks.adam_views + batch)
             yield corrected_moments(adam["scales"], params["scales"])
-        rest = detach(params, adam, {}, clocks)
+        stored = detach(params, adam, {}, clocks)
 
 
 @pytest.mark.parametrize(

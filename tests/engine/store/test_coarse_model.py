@@ -9,7 +9,7 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, split_off
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, stored_blocks
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
@@ -30,7 +30,7 @@ def test_a_store_begins_with_each_point_in_its_block_or_deferred():
     cloud = cloud_from_points(*random_points(90, 2.0), sh_degree=1)
     tree = build_kd(cloud.means, 4)
     coarse, others = split_off(cloud, 40, seed=3)
-    content = dict(blocks_at_rest(tree, cloud, room=40, seed=3))
+    content = dict(stored_blocks(tree, cloud, room=40, seed=3))
     deferred = content.pop(DEFERRED)
     assert all(torch.equal(deferred.tensors[name], value) for name, value in others.tensors.items())
     owner, whole = tree.assign(coarse.means), coarse.gaussians()
@@ -41,7 +41,7 @@ def test_a_store_begins_with_each_point_in_its_block_or_deferred():
     assert list(content) == [0, 1, 2, 3]
 
 
-def test_the_whole_coarse_model_is_live_and_nothing_else_is_seen(make, views, photos):
+def test_the_whole_coarse_model_is_active_and_nothing_else_is_seen(make, views, photos):
     coordinator = make(blocks=4, steps=40, coarse_model=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
@@ -84,12 +84,12 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
         coordinator.next_batch()
         active = coordinator.state.active
         if active.done == 0:
-            live, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
-            faint = torch.sigmoid(live).sub(REVEALED_OPACITY).abs() < 1e-6
-            assert len(live) == found
+            logits, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
+            faint = torch.sigmoid(logits).sub(REVEALED_OPACITY).abs() < 1e-6
+            assert len(logits) == found
             assert bool(faint.any())
             # What windows and views go by.
-            assert len(scene.gaussians_at_rest(active.geometry.block)) == found
+            assert len(scene.stored_with_pending(active.geometry.block)) == found
             visited.add(active.geometry.block)
         for block in set(range(4)) - visited:
             assert 0 < len(scene.gaussians(block)) < scene.count(block)
@@ -108,12 +108,12 @@ def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, 
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
     coordinator = make(**LONG, coarse_model=len(start), coarse_gaussians=most, density=GROWING)
     train(coordinator, photos, steps=29)
-    live = len(coordinator.params["means"])
-    assert live == coordinator.count()
-    assert live == most if most == 125 else live > 125 if most else live <= len(start)
+    active = len(coordinator.params["means"])
+    assert active == coordinator.count()
+    assert active == most if most == 125 else active > 125 if most else active <= len(start)
     train(coordinator, photos, steps=1)
     assert coordinator.state.active is None
-    assert coordinator.count() == live
+    assert coordinator.count() == active
     assert coordinator.scene.clocks(0).refined > 0
 
 

@@ -13,10 +13,10 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.store.coarse_model import blocks_at_rest
+from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.engine.store.disks import PATIENCE, Disk, on_disk, wait_until
@@ -32,7 +32,7 @@ def scene(tmp_path) -> StoredScene:
     gaussians = random_gaussians(40)
     tree = build_kd(gaussians.means, 4)
     store = ParameterStore.create(tmp_path / "store", {"tree": tree.to_json()})
-    store.commit(blocks_at_rest(tree, gaussians), state={"step": 0})
+    store.commit(stored_blocks(tree, gaussians), state={"step": 0})
     return StoredScene(tree, store)
 
 
@@ -41,15 +41,15 @@ def disk(scene) -> Disk:
     return Disk(scene.store)
 
 
-def rest(scene: StoredScene, step: int, *blocks: int, within: float = PATIENCE) -> None:
-    """Put blocks to rest, each with one Gaussian fewer."""
+def persist(scene: StoredScene, step: int, *blocks: int, within: float = PATIENCE) -> None:
+    """Persist blocks, each with one Gaussian fewer."""
     fewer = {block: BlockState.fresh(scene.state(block).gaussians[1:]) for block in blocks}
-    scene.rest(scene.tree, fewer, {"step": step}, within=within)
+    scene.persist(scene.tree, fewer, {"step": step}, within=within)
 
 
-def rest_aside(scene: StoredScene, *args) -> threading.Thread:
-    """`scene.rest` in a thread of its own, since it may have to wait."""
-    thread = threading.Thread(target=scene.rest, args=(scene.tree, *args), daemon=True)
+def persist_aside(scene: StoredScene, *args) -> threading.Thread:
+    """`scene.persist` in a thread of its own, since it may have to wait."""
+    thread = threading.Thread(target=scene.persist, args=(scene.tree, *args), daemon=True)
     thread.start()
     return thread
 
@@ -57,7 +57,7 @@ def rest_aside(scene: StoredScene, *args) -> threading.Thread:
 def hold_up(scene: StoredScene, disk: Disk, step: int, block: int) -> None:
     """Have a write begin, and take its time."""
     disk.free.clear()
-    rest(scene, step, block, within=SOON)
+    persist(scene, step, block, within=SOON)
     assert disk.asked.wait(PATIENCE)
 
 
@@ -68,7 +68,7 @@ def test_what_waits_is_left_out_and_pending_migrants_are_drawn_picked_or_not(sce
     state = scene.state(1)
     deferred = torch.arange(len(state)) % 3 == 0
     migrants = BlockState.fresh(state.gaussians[2:5])  # in the block's cell
-    scene.rest(scene.tree, {1: replace(state, deferred=deferred), PENDING: migrants}, {}, within=60.0)
+    scene.persist(scene.tree, {1: replace(state, deferred=deferred), PENDING: migrants}, {}, within=60.0)
     seen = Gaussians.cat([state.gaussians[~deferred], migrants.gaussians])
     expected = seen if which is None else seen[which(seen.means, seen.scales)]
     assert which is None or 0 < len(expected) < len(seen)
@@ -82,7 +82,7 @@ def test_bounds_follow_migrants_without_another_look_at_the_block(scene, monkeyp
     for rows in ([0, 1], [4], []):
         migrants = BlockState.fresh(state.gaussians[torch.tensor(rows, dtype=torch.long)])
         migrants.gaussians.scales[:] += 2.0
-        scene.rest(scene.tree, {PENDING: migrants}, {}, within=60.0)
+        scene.persist(scene.tree, {PENDING: migrants}, {}, within=60.0)
         box, expected = scene.bounds(1), bounds_of(Gaussians.cat([state.gaussians, migrants.gaussians]))
         assert box.lower.tolist() == expected.lower.tolist()
         assert box.upper.tolist() == expected.upper.tolist()
@@ -93,11 +93,11 @@ def test_bounds_follow_migrants_without_another_look_at_the_block(scene, monkeyp
 
 def test_nothing_is_written_before_its_time_and_then_all_at_once(scene, disk):
     for step in (1, 2, 3):
-        rest(scene, step, step % 2)
+        persist(scene, step, step % 2)
     assert disk.commits == []
     assert on_disk(scene) == {"step": 0}
     assert [scene.count(0), scene.count(1)] == [9, 8]
-    rest(scene, 3, within=SOON)
+    persist(scene, 3, within=SOON)
     wait_until(lambda: disk.commits)
     assert disk.commits == [({0, 1}, {"step": 3})]
     assert on_disk(scene) == {"step": 3}
@@ -106,7 +106,7 @@ def test_nothing_is_written_before_its_time_and_then_all_at_once(scene, disk):
 def test_one_snapshot_is_written_and_one_waits_however_many_come(scene, disk):
     hold_up(scene, disk, 1, 0)
     for step in (2, 3, 4):
-        rest(scene, step, step - 1, within=SOON)
+        persist(scene, step, step - 1, within=SOON)
     disk.free.set()
     scene.flush()
     assert disk.commits == [({0}, {"step": 1}), ({1, 2, 3}, {"step": 4})]
@@ -115,27 +115,27 @@ def test_one_snapshot_is_written_and_one_waits_however_many_come(scene, disk):
 
 def test_what_waits_never_takes_more_ram_than_there_is(scene, disk):
     scene.ram_bytes = scene.state(0).packed().nbytes
-    scene.rest(scene.tree, {0: scene.state(0)}, {"step": 1}, within=PATIENCE)
+    scene.persist(scene.tree, {0: scene.state(0)}, {"step": 1}, within=PATIENCE)
     assert disk.commits == []
     disk.free.clear()
-    rests = rest_aside(scene, {1: scene.state(1)}, {"step": 2}, PATIENCE)
+    thread = persist_aside(scene, {1: scene.state(1)}, {"step": 2}, PATIENCE)
     assert disk.asked.wait(PATIENCE)
-    assert rests.is_alive()
+    assert thread.is_alive()
     disk.free.set()
-    rests.join(PATIENCE)
+    thread.join(PATIENCE)
     assert disk.commits == [({0, 1}, {"step": 2})]
 
 
-def test_a_large_live_block_is_written_beside_the_training_and_no_second_copy_is_made(scene, disk):
+def test_a_large_active_block_is_written_beside_the_training_and_no_second_copy_is_made(scene, disk):
     scene.ram_bytes = 1
     disk.free.clear()
-    scene.rest(scene.tree, {LIVE: scene.state(0)}, {"step": 1}, within=SOON)
+    scene.persist(scene.tree, {ACTIVE: scene.state(0)}, {"step": 1}, within=SOON)
     assert disk.asked.wait(PATIENCE)
     assert disk.commits == []
     assert not scene.is_due(SOON)
     disk.free.set()
     wait_until(lambda: scene.is_due(SOON))
-    assert disk.commits == [({LIVE}, {"step": 1})]
+    assert disk.commits == [({ACTIVE}, {"step": 1})]
 
 
 # Errors
@@ -148,7 +148,7 @@ def test_what_fails_after_a_write_is_said_and_nobody_waits_for_ever(scene, monke
     with monkeypatch.context() as patched:
         patched.setattr(scene._writer, "_written", fails)
         with pytest.raises(MemoryError):
-            rest(scene, 1, 0, within=0.0)
+            persist(scene, 1, 0, within=0.0)
     scene.flush()
     assert on_disk(scene) == {"step": 1}
     assert scene.unsaved_bytes == 0
@@ -156,11 +156,11 @@ def test_what_fails_after_a_write_is_said_and_nobody_waits_for_ever(scene, monke
 
 def test_a_write_that_failed_is_told_once_and_made_good_by_the_next(scene, disk):
     disk.refuses = True
-    rest(scene, 1, 0)
+    persist(scene, 1, 0)
     with pytest.raises(StoreError, match="full"):
         scene.flush()
     with pytest.raises(StoreError, match="full"):
-        rest(scene, 2, 1, within=0.0)
+        persist(scene, 2, 1, within=0.0)
     assert (on_disk(scene), scene.count(0), scene.count(1)) == ({"step": 0}, 9, 9)
     disk.refuses = False
     scene.flush()
@@ -176,7 +176,7 @@ def same(a: BlockState, b: BlockState) -> bool:
 
 def test_a_fork_waits_for_the_write_and_the_child_can_read(scene, disk):
     hold_up(scene, disk, 1, 0)
-    rest(scene, 2, 1, within=10 * PATIENCE)
+    persist(scene, 2, 1, within=10 * PATIENCE)
     threading.Timer(0.2, disk.free.set).start()
     pid = os.fork()
     if pid == 0:
@@ -281,9 +281,9 @@ def test_a_long_visit_is_saved_by_the_clock(make, photos):
     coordinator = make(blocks=1, steps=50, commit_seconds=60.0)
     train(coordinator, photos, steps=3)
     assert on_disk(coordinator.scene).get("step", 0) == 0
-    coordinator.scene._rested -= 61.0
+    coordinator.scene._persisted -= 61.0
     train(coordinator, photos, steps=1)
     wait_until(lambda: on_disk(coordinator.scene).get("step") == 4)
-    assert coordinator.scene.rows(LIVE) == coordinator.count()
+    assert coordinator.scene.rows(ACTIVE) == coordinator.count()
     coordinator.close()
     assert make(resume=True, steps=50).state.step == 4

@@ -10,7 +10,7 @@ from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan
 from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, WHOLE
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -128,9 +128,9 @@ def test_migrants_take_their_moments_along(make, photos):
         coordinator.params["means"][0] = coordinator.scene.gaussians(other).means[0]
     moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
     row = coordinator.params["scales"][0].detach().clone()
-    arrived_before, at_rest = coordinator.scene.count(other), coordinator.scene.state(other)
+    arrived_before, stored = coordinator.scene.count(other), coordinator.scene.state(other)
     train_step(coordinator, photos)
-    assert equal(coordinator.scene.state(other).gaussians, at_rest.gaussians)
+    assert equal(coordinator.scene.state(other).gaussians, stored.gaussians)
     arrived = with_pending(coordinator.scene, other)
     assert len(arrived) == coordinator.scene.count(other) == arrived_before + 1
     assert equal(coordinator.scene.gaussians(other), arrived.gaussians)
@@ -145,7 +145,7 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, bloc
     options = {"blocks": blocks, "steps": 30, "density": GROWING, "layer_bytes": 60_000}
     _, resumed = assert_resumes(make, photos, *stops, **options)
     store = resumed.scene.store
-    assert LIVE not in store.blocks or store.counts(LIVE) == 0
+    assert ACTIVE not in store.blocks or store.counts(ACTIVE) == 0
 
 
 def test_blocks_that_no_view_sees_are_left_alone(make, photos, start):
@@ -168,7 +168,7 @@ def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(make,
     coordinator.state.active = None
     coordinator.state.queue.clear()
     come = coordinator.scene.state(unseen)[:3]
-    coordinator.run.rest(coordinator.scene.tree, {PENDING: come}, within=0.0)
+    coordinator.run.persist(coordinator.scene.tree, {PENDING: come}, within=0.0)
     assert coordinator.scene.pending_for(unseen) is not None
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)

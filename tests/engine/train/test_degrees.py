@@ -138,11 +138,11 @@ def test_degrees_go_in_the_later_half_and_stay_away(make, photos, blocks):
         train_step(coordinator, photos)
         if coordinator.run.share < degrees.START:
             assert coordinator.scene.parameters() == whole
-        elif coordinator.state.active is not None and GONE in coordinator.visit.live.growth:
-            live, adam = coordinator.params["features_rest"], coordinator.optimizers["features_rest"]
-            kept = 2 - coordinator.visit.live.growth[GONE]
-            moments = adam.state[live]
-            for value in (live, moments["exp_avg"], moments["exp_avg_sq"]):
+        elif coordinator.state.active is not None and GONE in coordinator.visit.block.growth:
+            harmonics, adam = coordinator.params["features_rest"], coordinator.optimizers["features_rest"]
+            kept = 2 - coordinator.visit.block.growth[GONE]
+            moments = adam.state[harmonics]
+            for value in (harmonics, moments["exp_avg"], moments["exp_avg_sq"]):
                 assert bool((degrees_in_use([value.detach()]) <= kept).all())
             gone.append(float(kept.mean()))
     assert len(gone) > 10
@@ -158,11 +158,11 @@ def test_a_run_that_was_interrupted_keeps_its_degrees(make, photos):
 
 def test_a_visit_that_draws_each_view_once_is_enough_to_judge_by(make, photos, truth):
     coordinator = make(start=truth, blocks=1, steps=20, density=STILL, batch=1)
-    live = coordinator.visit.live
+    block = coordinator.visit.block
     while coordinator.run.share < degrees.START:
         train_step(coordinator, photos)
-    live.growth = {**live.growth, **statistics(len(live))}
-    assert live.growth["passes"].tolist() == [1.0] * len(live)
-    live.prune()
-    assert float(live.growth[GONE].max()) > 0
-    assert live.growth["passes"].tolist() == [0.5] * len(live)
+    block.growth = {**block.growth, **statistics(len(block))}
+    assert block.growth["passes"].tolist() == [1.0] * len(block)
+    block.prune()
+    assert float(block.growth[GONE].max()) > 0
+    assert block.growth["passes"].tolist() == [0.5] * len(block)

@@ -7,7 +7,7 @@ import torch
 from gsplat.strategy import MCMCStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, nothing_active
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density import control as control_module
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl
@@ -21,8 +21,8 @@ VIEWS = 5
 BINOMIALS = MCMCStrategy().initialize_state()["binoms"]
 
 
-def live(gaussians: Gaussians):
-    params, optimizers = nothing_live(gaussians.sh_degree)
+def active(gaussians: Gaussians):
+    params, optimizers = nothing_active(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     return params, optimizers
 
@@ -46,7 +46,7 @@ def clock(**changes) -> DensityClock:
 def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     monkeypatch.setattr(control_module, "MOST_NEW", 1.0)
     gaussians = random_gaussians(8, size=0.001)
-    params, optimizers = live(gaussians)
+    params, optimizers = active(gaussians)
     control = DensityControl(DensityConfig(split_pixels=6.0, cull_alpha_thresh=0.0))
     growth = statistics(*[7.0] * 5, *[5.0] * 3)
     growth = control.after_step(params, optimizers, growth, (), (), clock())
@@ -60,7 +60,7 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
 
 @pytest.mark.parametrize(("room", "added"), [(None, 30), (200, 30), (12, 12), (0, 0)])
 def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
-    params, optimizers = live(random_gaussians(300, size=0.001))
+    params, optimizers = active(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
     before = params["means"].detach().clone()
     control.after_step(params, optimizers, statistics(*range(100, 400)), (), (), clock(room=room))
@@ -72,7 +72,7 @@ def test_without_room_nothing_is_added_but_the_transparent_go():
     gaussians = random_gaussians(8, size=0.001)
     gaussians.opacities[:] = 2.0
     gaussians.opacities[:3] = -8.0
-    params, optimizers = live(gaussians)
+    params, optimizers = active(gaussians)
     control = DensityControl(DensityConfig())
     control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock(room=0))
     assert torch.equal(params["means"], gaussians.means[3:])
@@ -83,7 +83,7 @@ def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit(monkeypatch):
     gaussians = random_gaussians(100)
     gaussians.opacities[:] = 2.0
     gaussians.opacities[:10] = -9.0
-    params, optimizers = live(gaussians)
+    params, optimizers = active(gaussians)
     control = DensityControl(DensityConfig(strategy="mcmc"))
     control.after_step(params, optimizers, {}, (), (), clock(room=3))
     assert len(params["means"]) == 103
@@ -95,7 +95,7 @@ def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit(monkeypatch):
 def test_mcmc_leaves_the_dead_where_none_is_alive():
     gaussians = random_gaussians(20)
     gaussians.opacities[:] = -9.0
-    params, optimizers = live(gaussians)
+    params, optimizers = active(gaussians)
     DensityControl(DensityConfig(strategy="mcmc")).after_step(params, optimizers, {}, (), (), clock(room=3))
     assert len(params["means"]) == 20
 
@@ -106,11 +106,11 @@ def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
     control = DensityControl(DensityConfig(strategy="mcmc"))
     moved = []
     for seed in (1, 1, 2):
-        params, optimizers = live(gaussians)
+        params, optimizers = active(gaussians)
         before = torch.get_rng_state()
         control.after_step(params, optimizers, {}, (), (), clock(steps=7, refined=7, seed=seed))
         assert torch.equal(torch.get_rng_state(), before)
-        moved.append(live_gaussians(params).means.detach() - gaussians.means)
+        moved.append(active_gaussians(params).means.detach() - gaussians.means)
     assert torch.equal(moved[0], moved[1])
     assert not torch.equal(moved[0], moved[2])
     assert float(moved[0][:10].norm()) > 10 * float(moved[0][10:].norm())
@@ -143,7 +143,7 @@ def test_what_is_large_stays():
     gaussians.opacities[:] = 3.0
     gaussians.scales[0] = math.log(5.0)
     control = DensityControl(DensityConfig(refine_every=10))
-    params, optimizers = live(gaussians)
+    params, optimizers = active(gaussians)
     control.after_step(params, optimizers, statistics(*[0.0] * 8), (), (), clock(steps=510))
     assert len(params["means"]) == 8
 

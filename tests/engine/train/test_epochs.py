@@ -73,7 +73,7 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(mak
         batch = coordinator.next_batch()
         active = coordinator.run.active
         if active.done == 0:
-            expected = views_per_step(0, 3, trained=coordinator.visit.live.clocks.adam_views)
+            expected = views_per_step(0, 3, trained=coordinator.visit.block.clocks.adam_views)
         assert len(batch.samples) == coordinator.batch == expected
         drawn.add(expected)
         coordinator.after_step(coordinator.render(batch))
@@ -94,8 +94,8 @@ def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):
     assert len(together.params["means"]) == len(apart.params["means"])
     for name, value in together.params.items():
         assert_close(apart.params[name], value, rtol=1e-3, atol=1e-4)
-    for name, value in together.visit.live.growth.items():
-        assert_close(apart.visit.live.growth[name], value, rtol=1e-3, atol=1e-3)
+    for name, value in together.visit.block.growth.items():
+        assert_close(apart.visit.block.growth[name], value, rtol=1e-3, atol=1e-3)
 
 
 def test_a_queue_of_before_visits_knew_their_batch_is_read():
@@ -128,9 +128,9 @@ def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make,
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:
         train_step(coordinator, photos)
-        active, live = coordinator.state.active, coordinator.visit.live
+        active, block = coordinator.state.active, coordinator.visit.block
         if active is not None and not active.is_whole:
-            counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
+            counts[block.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(block))
     assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
     assert [len(found) for found in counts[False].values()] == [1, 1]
 
@@ -154,7 +154,7 @@ def test_moments_are_forgotten_at_the_next_visit_only_when_asked(make, photos, k
     adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
     assert int(adam["step"]) == (3 if keep else 0)
     assert bool(adam["exp_avg"].any()) == keep
-    assert coordinator.visit.live.clocks.visits == 1
+    assert coordinator.visit.block.clocks.visits == 1
 
 
 def test_a_run_without_moments_can_be_resumed_within_a_visit(make, photos):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, nothing_active
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -20,7 +20,7 @@ from tests.reference.scenes import random_gaussians, ring_of_views
 
 def after_split(gaussians: Gaussians, which, axis=None, growth=None):
     """The Gaussians afterwards, and their statistics."""
-    params, optimizers = nothing_live(gaussians.sh_degree)
+    params, optimizers = nothing_active(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     axis = gaussians.scales.argmax(dim=1) if axis is None else axis
     found = split_gaussians(params, optimizers, growth or {}, torch.as_tensor(which), axis)
@@ -28,7 +28,7 @@ def after_split(gaussians: Gaussians, which, axis=None, growth=None):
         (held,) = optimizers[name].param_groups[0]["params"]
         assert held is params[name]
         assert len(optimizers[name].state[held]["exp_avg"]) == len(held)
-    return live_gaussians(params).detach(), found
+    return active_gaussians(params).detach(), found
 
 
 def covariance(gaussians: Gaussians):

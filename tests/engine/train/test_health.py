@@ -13,7 +13,7 @@ from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
-from abcd_ns.engine.train.memory import OutOfRoomError, check_room, live_bytes
+from abcd_ns.engine.train.memory import OutOfRoomError, active_bytes, check_room
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -69,7 +69,7 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     coordinator = make(blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
-    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Repaired)
+    before, told = coordinator.scene.stored_with_pending(block), listen(coordinator, Repaired)
     with torch.no_grad():
         coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
@@ -81,8 +81,8 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     assert repaired == [("moments", 1, block), ("values", 1, block)]
     assert bool((squares[0] == 0).all())
     assert torch.equal(squares[1], kept)
-    live = coordinator.scene.gaussians(block)
-    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in live.items())
+    after = coordinator.scene.gaussians(block)
+    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in after.items())
     moments = coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"]
     assert bool((moments[4] == 0).all())
     assert bool((moments[5] != 0).any())
@@ -143,9 +143,9 @@ def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
     """A wall of one colour may be one oversized Gaussian."""
     coordinator = make(blocks=1, steps=40, warmup=0.0, density=STILL)
     train(coordinator, photos, steps=12)
-    live = coordinator.visit.live
-    live.growth = {"weight": torch.zeros(len(live)), "passes": torch.ones(len(live))}
-    live.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
+    block = coordinator.visit.block
+    block.growth = {"weight": torch.zeros(len(block)), "passes": torch.ones(len(block))}
+    block.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
     with torch.no_grad():
         coordinator.params["scales"][:2] = 5.0
     train_step(coordinator, photos)
@@ -198,7 +198,7 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
-    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: live_bytes(30, 1))
+    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: active_bytes(30, 1))
     coordinator = make(blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)
@@ -211,9 +211,9 @@ def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks, stra
     options = {"blocks": blocks, "steps": 30, "density": density}
     coordinator = make(**options)
     train(coordinator, photos, steps=2)
-    nobody = coordinator.visit.live.detached()[:0]
+    nobody = coordinator.visit.block.detached()[:0]
     attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
-    coordinator.visit.live.growth = {}
+    coordinator.visit.block.growth = {}
     batch = coordinator.next_batch()
     wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
     assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad
@@ -252,7 +252,7 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(make, phot
     coordinator = make(blocks=2, steps=200, visit_steps=10)
     train_step(coordinator, photos)
     coordinator.state.active.showing = tuple(range(seen))
-    clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
+    clock = coordinator.visit.block.density_clock(4, coordinator.batch, None)
     assert (clock.views, min(clock.views, clock.visit)) == (seen, expected)
     control = DensityControl(DensityConfig(refine_every=1))
     due = replace(clock, progress=0.02, refined=0, first=False)

@@ -118,7 +118,7 @@ def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(gro
     assert first == {block: [0, 1, 2, 3, 4] for block in range(4)}
 
 
-def test_when_the_warm_up_is_over_nothing_of_it_stays_live(begin, photos):
+def test_when_the_warm_up_is_over_nothing_of_it_stays_active(begin, photos):
     coordinator, seen = begin(), []
 
     def note(event):

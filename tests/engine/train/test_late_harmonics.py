@@ -2,7 +2,7 @@
 
 import pytest
 
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, whole_scene
@@ -22,12 +22,12 @@ def highest_of(coordinator) -> int:
     return int(degrees_in_use([whole_scene(coordinator).features_rest]).max())
 
 
-def test_what_is_live_has_no_more_harmonics_than_are_in_use(make, photos, start):
+def test_what_is_active_has_no_more_harmonics_than_are_in_use(make, photos, start):
     coordinator, found = make(block_limit=ROOMY, **LATE), set()
     while not coordinator.finished:
         train_step(coordinator, photos)
         if coordinator.state.active is not None:
-            found.add((coordinator.run.share < 0.5, live_gaussians(coordinator.params).sh_degree))
+            found.add((coordinator.run.share < 0.5, active_gaussians(coordinator.params).sh_degree))
     assert {degree for is_early, degree in found if is_early} == {0}
     assert (False, start.sh_degree) in found
     assert highest_of(coordinator) == start.sh_degree
@@ -49,7 +49,7 @@ def test_while_the_degree_rises_others_see_all_harmonics(make, photos, start):
     """As a viewer does, which draws with the highest degree at any time."""
     coordinator = make(blocks=1, steps=40, density=STILL)
     train(coordinator, photos, steps=1)
-    assert live_gaussians(coordinator.params).sh_degree < start.sh_degree
+    assert active_gaussians(coordinator.params).sh_degree < start.sh_degree
     assert coordinator.scene.gaussians(0).sh_degree == start.sh_degree
     assert coordinator.scene.everything("cpu").sh_degree == start.sh_degree
 
@@ -60,6 +60,6 @@ def test_a_degree_that_rises_within_a_step_waits_for_the_next(make, monkeypatch)
     batch = coordinator.next_batch()
     monkeypatch.setattr(type(coordinator.run), "sh_degree", 1)
     coordinator.render(batch)
-    assert live_gaussians(coordinator.params).sh_degree == 0
+    assert active_gaussians(coordinator.params).sh_degree == 0
     coordinator.next_batch()
-    assert live_gaussians(coordinator.params).sh_degree == 1
+    assert active_gaussians(coordinator.params).sh_degree == 1

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import Repaired
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import attach, nothing_live
+from abcd_ns.engine.gaussians.param_swap import attach, nothing_active
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import weights
@@ -162,7 +162,7 @@ def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, v
 def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(progress, gone):
     opacity, contributions = [0.02, 0.07, 0.02, 0.07, *[0.9] * 5], [90.0, 90.0, 9.0, 9.0, 90.0, *[9.0] * 4]
     gaussians = replace(random_gaussians(9), opacities=torch.tensor(opacity).logit()[:, None])
-    params, optimizers = nothing_live(gaussians.sh_degree)
+    params, optimizers = nothing_active(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     growth = {**statistics(contributions, [1.0] * 9), "count": torch.ones(9)}
     DensityControl(DensityConfig(min_contribution=1.0)).prune(params, optimizers, growth, progress)

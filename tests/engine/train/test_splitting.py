@@ -7,7 +7,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.density import control
-from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
+from abcd_ns.engine.train.density.splitting import FULL, cut_stored, split_full
 from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
@@ -86,7 +86,7 @@ def test_a_run_never_has_a_larger_block_than_it_may(make, photos, monkeypatch):
     assert {event.block for event in seen if isinstance(event, VisitBegan)} >= {cut.new for cut in cuts[:1]}
     assert coordinator.scene.store.header["tree"] == tree.to_json()
     for block in range(tree.num_blocks):
-        means = coordinator.scene.gaussians_at_rest(block).means
+        means = coordinator.scene.stored_with_pending(block).means
         assert bool((tree.assign(means) == block).all())
 
 
@@ -124,9 +124,9 @@ def test_a_run_with_a_smaller_limit_goes_on_within_the_visit_that_was_under_way(
     scene, state = first.scene, RunState.from_json(first.scene.store.state)
     assert state.active.saved
     block = state.active.geometry.block
-    scene.clear_live()
+    scene.clear_active()
     before = scene.rows(block)
-    cut_at_rest(scene, state, Limits(40, sole_limit=sole_limit))
+    cut_stored(scene, state, Limits(40, sole_limit=sole_limit))
     assert scene.tree.num_blocks > 2
     assert sum(map(scene.count, range(scene.tree.num_blocks))) == len(start)
     assert (scene.rows(block) == before) == (state.active is not None) == (blocks == 2)

@@ -1,6 +1,6 @@
 """The light each photo was taken in: a colour transform of its finished picture, found while training.
 
-F, the live block, B and the background are composited first. So no layer hangs on a transform, and all stay
+F, the active block, B and the background are composited first. So no layer hangs on a transform, and all stay
 valid whatever becomes of it. Transforms belong to the run and not to a block: of each photo there is one.
 """
 
@@ -87,7 +87,7 @@ class Light:
         self._changes[places] = after
         self._sum += (after.to(self._sum) - before.to(self._sum)).sum(dim=0)
 
-    # -- at rest -------------------------------------------------------------------------------------
+    # -- persist and restore -------------------------------------------------------------------------
 
     def changed(self) -> dict[str, Packed]:
         """All that has changed since the last call, by the names under which it is to be kept; shares no

@@ -17,7 +17,7 @@ from gsplat.strategy import ops as gsplat_ops
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.growing import chosen, split_gaussians
@@ -131,7 +131,7 @@ class DensityClock:
 
 
 class DensityControl:
-    """Applies the configured strategy to the live block."""
+    """Applies the configured strategy to the active block."""
 
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
         self.config, self._axes = config, primitive.axes
@@ -210,7 +210,7 @@ class DensityControl:
         if self.config.strategy == "default":
             growth = added(growth, blend_sums(infos, clock.views))
             for picture in judged:
-                add_picture(growth, live_gaussians(params).detach(), self._axes, picture)
+                add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
             if not self.asks(clock.progress, clock.first):
                 growth.pop(WORTH, None)
             if not self.refines(clock, growth):

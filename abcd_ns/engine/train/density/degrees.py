@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import MOMENTS
-from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, up_to_degree
 from abcd_ns.engine.train.density.pruning import contributions, have_contributions
 from abcd_ns.engine.transfer import upload
@@ -66,7 +66,7 @@ def are_gone(
 def lower(
     params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
-    """Let harmonics of the live block go that do not pay, with their moments; see `lowered`.
+    """Let harmonics of the active block go that do not pay, with their moments; see `lowered`.
 
     Returns:
         The block's statistics from now on.
@@ -74,7 +74,7 @@ def lower(
     if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
-    found = lowered(live_gaussians(params).detach(), growth, views, highest)
+    found = lowered(active_gaussians(params).detach(), growth, views, highest)
     dc.copy_(found.features_dc)
     rest.copy_(found.features_rest)
     adam, gone = optimizers["features_rest"].state[rest], are_gone(found.gone, rest, highest)

@@ -1,4 +1,4 @@
-"""Blocks that outgrow what the device holds are cut in two where they come to rest."""
+"""Blocks that outgrow what the device holds are cut in two when they are persisted."""
 
 from abcd_ns.engine.events import Announcer, BlockSplit
 from abcd_ns.engine.gaussians.block_state import BlockState, join
@@ -7,7 +7,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.store.commit import pending_without, with_pending, without
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import LIVE, PENDING, BlockName
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 
@@ -23,11 +23,10 @@ def split_full(
     Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
 
     Args:
-        updates: blocks that are about to be put to rest; what has a special name is left alone.
+        updates: blocks that are about to be persisted; what has a special name is left alone.
 
     Returns:
-        The tree with the cuts, everything to be put to rest, and of each new block the one that it was part
-        of.
+        The tree with the cuts, everything to persist, and of each new block the one that it was part of.
     """
     parents: dict[int, int] = {}
     waiting = sorted(block for block in updates if isinstance(block, int))
@@ -56,8 +55,8 @@ def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
 def with_full(
     scene: StoredScene, updates: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
-    """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
-    these there might be no room in it.
+    """What is about to be persisted, and the blocks that are full with those that wait for their visit. There
+    might be no room for these in it.
 
     Args:
         busy: blocks that are being trained.
@@ -87,7 +86,7 @@ def cut_full(
         updates: as of `split_full`.
 
     Returns:
-        The tree with the cuts, and everything to be put to rest.
+        The tree with the cuts, and everything to persist.
     """
     busy = {visit.geometry.block for visit in state.in_flight}
     tree, updates, parents = split_full(scene.tree, with_full(scene, updates, limits, busy), limits)
@@ -97,7 +96,7 @@ def cut_full(
     return tree, updates
 
 
-def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
+def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
     """Cut the blocks of a run that resumes with smaller limits than it had; nothing where all are in order.
 
     A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
@@ -108,16 +107,16 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
         in_visit = active is not None and (active.is_whole or active.geometry.block == block)
         if in_visit and not active.is_joint:
             continue
-        lives = in_visit and active.saved
-        rows = scene.rows(LIVE) if lives else scene.count(block)
+        saved = in_visit and active.saved
+        rows = scene.rows(ACTIVE) if saved else scene.count(block)
         if not is_full(rows, scene.tree.num_blocks, limits):
             continue
-        if lives:
-            live = scene.state(LIVE)
-            large = {block: live, LIVE: live.nobody}
+        if saved:
+            found = scene.state(ACTIVE)
+            large = {block: found, ACTIVE: found.nobody}
         else:
             large = {block: with_pending(scene, block), **pending_without(scene, {block})}
         tree, parts = cut_full(scene, large, state, limits, Announcer())
         if tree is not scene.tree:
             state.active = active = None if active is None or active.is_joint else active
-            scene.rest(tree, parts, state.to_json())
+            scene.persist(tree, parts, state.to_json())

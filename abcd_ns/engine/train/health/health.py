@@ -1,4 +1,4 @@
-"""Notices what goes wrong in the live block, counts it, and repairs what can be repaired.
+"""Notices what goes wrong in the active block, counts it, and repairs what can be repaired.
 
 In any run: gradients, moments and values that are no numbers (in exact joint training gradients alone). Where
 blocks are trained within layers: oversized Gaussians. A run in which nothing goes wrong is the same with or
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import Announcer, Repaired
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
-from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.commit import state_for_visit
 from abcd_ns.engine.store.scene import VisitScene
@@ -38,7 +38,7 @@ LATE_AFTER = 16
 
 
 class Health:
-    """Watches the live block of a coordinator.
+    """Watches the active block of a coordinator.
 
     Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
 
@@ -81,7 +81,7 @@ class Health:
         self._clean, self._psnr = LATE_AFTER, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
-        """Take note of how large a part of a picture the live block was, while none has shown it."""
+        """Take note of how large a part of a picture the active block was, while none has shown it."""
         self._shares.append(share)
 
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
@@ -139,10 +139,10 @@ class Health:
         return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
 
     def end_visit(self, detach: Callable[[], BlockState]) -> BlockState:
-        """What the visit leaves behind: the live block, repaired.
+        """What the visit leaves behind: the active block, repaired.
 
         Args:
-            detach: takes the live block out.
+            detach: takes the active block out.
         """
         self.look_over()
         state, record, active = detach(), self._record, self._active
@@ -153,7 +153,7 @@ class Health:
         return state
 
     def count(self, what: str, count: int) -> None:
-        """So much of the live block had to be repaired; see BlockHealth for what."""
+        """So much of the active block had to be repaired; see BlockHealth for what."""
         if count:
             record, active = self._record, self._active
             setattr(record, what, getattr(record, what) + count)
@@ -162,7 +162,7 @@ class Health:
             self._announce(Repaired(number, None if alone else active.geometry.block, what, count))
 
     def look_over(self) -> None:
-        """Repair all that is no number in the live block; call when a visit ends, and before saving."""
+        """Repair all that is no number in the active block; call when a visit ends, and before saving."""
         self._read()
         self._repair()
 
@@ -199,26 +199,26 @@ class Health:
                     bad = ~torch.isfinite(adam[moment]).flatten(1).all(dim=1)
                     adam[moment][bad] = 0.0
                     self.count("moments", int(bad.sum()))
-        live = live_gaussians(self._params)
-        rows = unsound(live).nonzero()[:, 0]
+        gaussians = active_gaussians(self._params)
+        rows = unsound(gaussians).nonzero()[:, 0]
         if len(rows) == 0:
             return
-        sound = self._known(live, rows).of_degree(live.sh_degree)
-        for name, value in live.items():
+        sound = self._known(gaussians, rows).of_degree(gaussians.sh_degree)
+        for name, value in gaussians.items():
             value[rows] = getattr(sound, name).to(value)
             self._forget_moments(name, rows)
         self.count("values", len(rows))
 
-    def _known(self, live: Gaussians, rows: Tensor) -> Gaussians:
-        """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
+    def _known(self, gaussians: Gaussians, rows: Tensor) -> Gaussians:
+        """Numbers for `rows`: as stored where rows still are what they were, else stand-ins."""
         active = self._active
         if active is not None and self._params["means"] is self._attached:
             before = state_for_visit(self._scene, active.geometry.block, self._resumed).gaussians
-            if len(before) == len(live):
+            if len(before) == len(gaussians):
                 kept = before[rows.cpu()]
                 if not bool(unsound(kept).any()):
                     return kept
-        return stand_ins(live[~unsound(live)], len(rows))
+        return stand_ins(gaussians[~unsound(gaussians)], len(rows))
 
     def _forget_moments(self, name: str, rows: Tensor) -> None:
         adam = self._optimizers[name].state[self._params[name]]

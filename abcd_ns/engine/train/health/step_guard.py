@@ -73,6 +73,6 @@ class StepGuard:
 
     def _norms(self) -> list[Float[Tensor, ""]]:
         """Of all gradients. An overflow of the squares counts, as it would in Adam's second moment."""
-        live = [p for o in self._optimizers.values() for p in o.param_groups[0]["params"]]
-        gradients = [p.grad for p in live if p.grad is not None and p.grad.numel()]
+        parameters = [p for o in self._optimizers.values() for p in o.param_groups[0]["params"]]
+        gradients = [p.grad for p in parameters if p.grad is not None and p.grad.numel()]
         return list(torch._foreach_norm(gradients)) if gradients else []

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, raise_degree
+from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, raise_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
@@ -29,7 +29,7 @@ FILLS = 0.01
 
 
 class ActiveBlock:
-    """What is live in a run's parameters, with what density control has gathered of it."""
+    """What is active in a run's parameters, with what density control has gathered of it."""
 
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
@@ -44,7 +44,7 @@ class ActiveBlock:
         return len(self._run.params["means"])
 
     def attach(self, active: ActiveVisit, batch: int, sh_degree: int) -> None:
-        """Make the block of a visit live, as it is at rest.
+        """Make the block of a visit active, as it is stored.
 
         Args:
             batch: views in a step.
@@ -55,17 +55,18 @@ class ActiveBlock:
         """
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(rows_for_visit(*which), sh_degree, run.device)
-        rest = state_for_visit(*which)
+        stored = state_for_visit(*which)
         if sh_degree < self._highest:  # what a block begins with may have more
-            used = degrees_in_use([rest.gaussians.features_rest])
-            rest = rest.of_degree(max((sh_degree, *used.unique().tolist())))
-        rest = rest.to(run.device)
+            used = degrees_in_use([stored.gaussians.features_rest])
+            stored = stored.of_degree(max((sh_degree, *used.unique().tolist())))
+        stored = stored.to(run.device)
         self.is_new = not active.is_whole and bool(run.scene.state(active.geometry.block).deferred.any())
         if active.done == 0 and not run.config.recipe.keep_moments:
-            rest = rest.forgetful()
-        attach(rest, run.params, run.optimizers, batch=batch)
+            stored = stored.forgetful()
+        attach(stored, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
-        self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
+        self.growth = {name: value.clone() for name, value in stored.growth.items()}
+        self.clocks = stored.clocks
         come_late = run.config.limits.late_harmonics > 0  # and may have had no time to be of use
         if active.done == 0 and not (active.saved or active.is_alone or come_late):
             self._lower_degrees()
@@ -79,7 +80,7 @@ class ActiveBlock:
         self._run.state.sh_degree = max(self._run.state.sh_degree, sh_degree)
 
     def detached(self) -> BlockState:
-        """The live block, on the CPU; it stays live."""
+        """The active block, on the CPU; it stays active."""
         if GONE in self.growth:  # what was repaired may have them again
             rest = self._run.params["features_rest"]
             rest.data.masked_fill_(are_gone(self.growth[GONE], rest, self._highest), 0.0)
@@ -91,7 +92,7 @@ class ActiveBlock:
         return self._run.config.sh_degree
 
     def let_go(self) -> None:
-        """Nothing is live any more, and the device has its memory back."""
+        """No block is active any more, and the device has its memory back."""
         run = self._run
         nobody = BlockState.fresh(Gaussians.empty(run.config.sh_degree, run.device))
         attach(nobody, run.params, run.optimizers)
@@ -153,8 +154,8 @@ class ActiveBlock:
         change too little. What is seen from now on soon counts for more."""
         run, before, found = self._run, len(self), 0.0
         if before and run.density.wants_weights and run.share >= run.config.density.refine_stop:
-            live = live_gaussians(run.params).detach()
-            found = veils(live, list(run.views.values()), run.rasterizer, run.config.antialiased)
+            active = active_gaussians(run.params).detach()
+            found = veils(active, list(run.views.values()), run.rasterizer, run.config.antialiased)
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()

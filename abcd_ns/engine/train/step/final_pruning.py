@@ -80,7 +80,7 @@ class _Probe:
 
 
 class FinalPruning:
-    """Takes out of a run's scene, all of it at rest, as many Gaussians as cost LOSS at most.
+    """Takes out of a run's scene, all of it stored, as many Gaussians as cost LOSS at most.
 
     Args:
         target: gives what a sample should show.
@@ -122,7 +122,7 @@ class FinalPruning:
         run.announce(PrunedAtEnd(gone, run.count(), len(views), before, after))
 
     def _room(self, views: Sequence[View]) -> int:
-        """Of a device, for blocks that are held there while none is live: a third of what a live one has."""
+        """Of a device, for blocks that are held there while none is active: a third of an active one's."""
         run, limit = self._run, self._run.config.limits.block_limit
         if run.device.type == "cpu":  # their RAM has a budget of its own
             return 0
@@ -181,14 +181,14 @@ class FinalPruning:
         return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts
 
     def _prune_block(self, block: int, worth: Float[Tensor, "n"], least: float) -> int:
-        """Put a block to rest with its migrants, without those worth at most `least`; return how many."""
+        """Persist a block with its migrants, without those worth at most `least`; return how many."""
         run, scene = self._run, self._run.scene
         gone = int((worth <= least).sum())
         if gone:
             state = with_pending(scene, block)
             stays = state.deferred.clone()  # who is not drawn
             stays[~state.deferred] = worth > least
-            run.rest(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
+            run.persist(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone
 
 
