@@ -65,7 +65,7 @@ class TrainingRun:
         self.poses = Poses(views)
         may_act = config.recipe.limit_scales and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
-        self.density = DensityControl(config.density, rasterizer.primitive)
+        self.density = DensityControl(config.density.for_views(len(views)), rasterizer.primitive)
 
     def views_at(self, reduction: int) -> dict[int, View]:
         """The training views by index, their pictures reduced."""

@@ -170,6 +170,11 @@ def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(p
     assert params["means"].tolist() == gaussians.means[left].tolist()
 
 
+def test_few_views_ask_for_less():
+    density = DensityConfig(min_contribution=8.0)
+    assert [density.for_views(n).min_contribution for n in (5, 12, 25, 500)] == [1.6, 3.84, 8.0, 8.0]
+
+
 def test_without_a_price_everything_stays(make, photos):
     coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, min_contribution=0.0))
     train(coordinator, photos)

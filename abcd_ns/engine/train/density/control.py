@@ -8,7 +8,7 @@ Here the schedule is in shares of the run and in the block's own steps, so it is
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -44,6 +44,8 @@ USUAL_REFINEMENTS, USUAL_VIEWS = 20, 100
 """A block that few views show is refined every so many views, and at least so many times in a run."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
+MANY_VIEWS = 25
+"""Of fewer, what a Gaussian contributes sums up to less: the minimum is in proportion to them."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 MCMC_NOISE_LR = 5e5
@@ -66,8 +68,8 @@ class DensityConfig:
     """Limit for the whole scene. 0 is none (mcmc: 1,000,000). Of more points, a random choice starts."""
     min_contribution: float = 8.0
     """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
-    Applies once growth ends. Strategy mcmc has the final pruning only.
-    0 turns all pruning by contribution off, of floaters too, and the final pruning."""
+    Applies once growth ends. Of n < 25 training views it is n / 25 of this. Strategy mcmc has the final
+    pruning only. 0 turns all pruning by contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
     """Split a Gaussian if that removes as much squared error as this many average pixels have.
     Both count in all views of its block. A refinement splits a tenth of the block at most."""
@@ -85,6 +87,10 @@ class DensityConfig:
     def prunes_at_end(self) -> bool:
         """Whether a final pruning follows the run."""
         return self.min_contribution > 0 and self.strategy != "off"
+
+    def for_views(self, count: int) -> "DensityConfig":
+        """The same for a scene of so many training views, see MANY_VIEWS."""
+        return replace(self, min_contribution=self.min_contribution * min(count / MANY_VIEWS, 1.0))
 
     @property
     def limit(self) -> int | None:
