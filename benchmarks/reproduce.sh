@@ -29,14 +29,13 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
     done
     $row equal-time/bonsai-320 13 bonsai 2 --seconds 300 --methods abcd-monolithic abcd --blocks 8
     $row equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
-    for scene in castle-P30 fox bonsai; do
-        $row blocks/$scene 12 $scene 4 --seconds 180 --methods abcd --blocks 1 8 32
+    $row blocks/castle-P30 12 castle-P30 4 --seconds 180 --methods abcd --blocks 1 8 32
+    for scene in castle-P30 caliterra fox; do # folders with 12 photos named in train_list.txt
+        $row few/$scene 5 $scene-12 4 --steps 1500 --methods abcd --blocks 1 8 $two_seeds \
+            --vary training.density.min-contribution=16.667
     done
-    $row blocks/land 12 land 1 --seconds 180 --methods abcd --blocks 1 8 32
     $row gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
         --vary training.density.min-contribution={0,1,4,16,64}
-    $row peers/castle-P30 13 castle-P30 4 --seconds 120 --blocks 8 \
-        --methods abcd-monolithic abcd abcd-exact abcd-partition abcd-ablated
     $row peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
 }
 

@@ -14,7 +14,7 @@ from abcd_ns.lab.results.results import SCHEMA, Arm, Results
 from abcd_ns.lab.results.tables import MEASURES, NOTHING, cell, markdown
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "results" / "README.md"
-TABLE = re.compile(r"(?<=<!-- table: )(.+?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL)
+TABLE = re.compile(r"(?<=<!-- table: )(.+?) -->\n(?:\|.*\n)*(?=<!-- end -->)")
 NAMES = {"abcd-monolithic": "one block"}
 BYTES = "gaussian_bytes="
 PSNR = next(measure for measure in MEASURES if measure.field == "psnr_merged")
@@ -24,7 +24,7 @@ def with_tables(text: str, folder: Path) -> str:
     """A page with its tables as the files in a folder have them."""
 
     def made(found: re.Match[str]) -> str:
-        return f"{found[1]} -->\n{table([folder / name for name in found[1].split()], folder)}"
+        return f"{found[1]} -->\n{table([folder / name for name in found[1].split()], folder)}\n"
 
     return TABLE.sub(made, text)
 
