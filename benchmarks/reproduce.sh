@@ -23,14 +23,13 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
         $row budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
     done
     $row budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
-    $row budgets/fox-640 50 fox 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
     for scene in castle-P30 fox caliterra; do
         $row equal-time/$scene 6 $scene 4 --seconds 60 --methods abcd-monolithic abcd --blocks 8 $two_seeds
     done
     $row equal-time/bonsai-320 13 bonsai 2 --seconds 300 --methods abcd-monolithic abcd --blocks 8
     $row equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
     $row blocks/castle-P30 12 castle-P30 4 --seconds 180 --methods abcd --blocks 1 8 32
-    for scene in castle-P30 caliterra fox; do # folders with 12 photos named in train_list.txt
+    for scene in castle-P30 caliterra fox; do
         $row few/$scene 5 $scene-12 4 --steps 1500 --methods abcd --blocks 1 8 $two_seeds \
             --vary training.density.min-contribution=16.667
     done
@@ -43,11 +42,23 @@ list() {
     printf '%-26s %3d min   abcd compare --data %s --downscale %s %s\n' "$1" "$2" "$3" "$4" "${*:5}"
 }
 
+with_12_photos() { # of those that are not held out, evenly spaced
+    local from=$DATA/${1%-12} to=$out/data/$1
+    mkdir -p "$to"
+    ln -sfn "$(realpath "$from/images")" "$to/images"
+    ln -sfn "$(realpath "$from/sparse")" "$to/sparse"
+    LC_ALL=C ls "$from/images" | awk 'NR % 8 == 1' > "$to/test_list.txt"
+    LC_ALL=C ls "$from/images" | awk 'NR % 8 != 1 {name[n++] = $0}
+        END {for (i = 0; i < 12; i++) print name[int((i + 0.5) * n / 12)]}' > "$to/train_list.txt"
+    echo "$to"
+}
+
 take() {
-    local name=$1 scene=$3 reduction=$4 wanted
+    local name=$1 data=$DATA/$3 reduction=$4 wanted
     for wanted in $asked; do
         [[ $wanted == all || $name == "$wanted"* ]] || continue
-        abcd compare --data "$DATA/$scene" --downscale "$reduction" "${@:5}" --pictures 0 --out "$out/$name"
+        [[ $3 != *-12 ]] || data=$(with_12_photos "$3")
+        abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures 0 --out "$out/$name"
     done
 }
 

@@ -56,7 +56,7 @@ def _by_variant(results: Results) -> Iterator[tuple[str, dict[str, Arm]]]:
 def _in_words(arm: Arm) -> str:
     count = f", {arm.mean('blocks'):.0f} blocks" if arm.mean("blocks") > 1 else ""
     scores = f"{cell(arm.runs, PSNR)} dB, {arm.mean('ssim_merged'):.3f}".replace(" 0.", " .")
-    return f"{scores}<br>{arm.mean('gaussians'):,.0f} Gaussians{count}, {arm.mean('train_seconds'):.0f} s"
+    return f"{scores}<br>{arm.mean('gaussians'):,.0f}{count}, {arm.mean('train_seconds'):.0f} s"
 
 
 if __name__ == "__main__":
