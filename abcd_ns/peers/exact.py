@@ -249,7 +249,7 @@ class ExactTrainer(Trainer):
         steps, views = state.clocks.steps + taken, state.clocks.adam_views + taken
         clocks = replace(state.clocks, steps=steps, adam_views=views)
         clock = self._clock_of(block, len(state), clocks, taken)
-        growth = self.run.density.after_step(
+        growth, refined = self.run.density.after_step(
             self.params,
             self.optimizers,
             {name: value.to(self.device) for name, value in state.growth.items()},
@@ -257,7 +257,7 @@ class ExactTrainer(Trainer):
             self._judged(gradients.sums[:, rows]),
             clock,
         )
-        if self.run.density.refines(clock, growth):
+        if refined:
             clocks = replace(clocks, refined=clock.steps)
         stepped = detach(self.params, self.optimizers, growth, clocks)
         attach(stepped[:0].to(self.device), self.params, self.optimizers)

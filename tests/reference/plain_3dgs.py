@@ -57,8 +57,8 @@ def train_plain(
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed, refined=refined)
         judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
         judged = [judged] if density.asks(taken / steps, first=False) else []
-        growth = density.after_step(params, adam, growth, (raster.info,), judged, clock)
-        refined = clock.steps if density.refines(clock, growth) else refined
+        growth, refines = density.after_step(params, adam, growth, (raster.info,), judged, clock)
+        refined = clock.steps if refines else refined
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 

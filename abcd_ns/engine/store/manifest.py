@@ -11,7 +11,7 @@ from abcd_ns.engine.store.special_blocks import BlockName, from_text, in_order
 from abcd_ns.errors import UserError
 
 FORMAT = "abcd-parameter-store"
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 
 
 class StoreError(UserError):

@@ -37,7 +37,7 @@ class TrainingConfig:
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     warmup: float = 0.35
     """Share of the run that trains a coarse model of the whole scene, before blocks. 0 for none.
-    Lasts up to twice as long, until each view was used 24 times.
+    Lasts up to 2.4 times as long, until each view was used 32 times.
     Ends after 24 uses of each view if not all points have room."""
     coarse: float = 0.2
     """Share of the run in which the warm-up, or a scene of one block, is trained on reduced pictures.

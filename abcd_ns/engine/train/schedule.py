@@ -19,10 +19,10 @@ UNDER_TRAINED = 500
 """Views that a block was trained on when a visit is planned, the warm-up's included, below which its steps
 draw one; two below twice as many, and so on. An under-trained block's steps are as large whatever they draw,
 see `rates_of_under_trained`: so there are more of them."""
-COARSE_MODEL_PASSES = 24
+COARSE_MODEL_PASSES, WARM_UP_PASSES = 24, 32
 """Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
-soon are as good as they can be. Elsewhere it goes on until then, for ..."""
-LONGER = 2
+soon are as good as they can be. Elsewhere at least, but for ..."""
+LONGER = 2.4
 """... so many times its share of the run at most: a run that cannot often show all views to the whole scene
 can do so even less to each block."""
 
@@ -59,7 +59,7 @@ def warm_up_is_over(progress: float, uses: float, share: float, deferred: int) -
     """
     if deferred:
         return warmed(progress, uses, share, deferred) >= 1
-    return progress >= share and (uses >= COARSE_MODEL_PASSES or progress >= LONGER * share)
+    return progress >= share and (uses >= WARM_UP_PASSES or progress >= LONGER * share)
 
 
 def warmed(progress: float, uses: float, share: float, deferred: int) -> float:

@@ -138,6 +138,7 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     """Where it has no room for all: then, and not only when its share of the run is over. Where it has, after
     twice its share at most, and not before its share is over."""
     monkeypatch.setattr("abcd_ns.engine.train.schedule.COARSE_MODEL_PASSES", passes)
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.WARM_UP_PASSES", passes)
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", longer)
     coordinator = make(blocks=4, steps=50, coarse_model=coarse_model, warmup=warmup, density=STILL)
     ended = listen(coordinator, VisitEnded)

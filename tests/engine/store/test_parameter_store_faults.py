@@ -205,12 +205,12 @@ def test_an_altered_manifest_is_found_even_if_json_reads_it_alike(store):
             ParameterStore.open(store.folder, read_only=True)
 
 
-@pytest.mark.parametrize("version", [7, 9, "8", None])
+@pytest.mark.parametrize("version", [8, 10, "9", None])
 def test_older_and_newer_formats_are_named(store, version):
     store.close()
     path = manifest_path(store.folder)
     path.write_text(json.dumps({**json.loads(path.read_bytes()), "version": version}))
-    with pytest.raises(StoreError, match=rf"format version {version}; this program reads version 8"):
+    with pytest.raises(StoreError, match=rf"format version {version}; this program reads version 9"):
         ParameterStore.open(store.folder)
 
 

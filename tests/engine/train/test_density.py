@@ -29,7 +29,7 @@ def active(gaussians: Gaussians):
 
 def statistics(*gains: float) -> dict[str, torch.Tensor]:
     """By which a split of each along its middle axis removes so much squared error, where a pixel has 1."""
-    found = torch.zeros(len(gains), 26)
+    found = torch.zeros(len(gains), 27)
     for half in (0, 12):
         found[:, half + 3] = (torch.tensor(gains) / VIEWS / 2).sqrt()
         found[:, half + 9 : half + 12] = 1.0
@@ -49,10 +49,11 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     params, optimizers = active(gaussians)
     control = DensityControl(DensityConfig(split_pixels=6.0, cull_alpha_thresh=0.0))
     growth = statistics(*[7.0] * 5, *[5.0] * 3)
-    growth = control.after_step(params, optimizers, growth, (), (), clock())
+    growth, refined = control.after_step(params, optimizers, growth, (), (), clock())
+    assert refined
     assert len(params["means"]) == 13
     assert not bool(growth[WORTH].any())
-    assert growth[WORTH].shape == (13, 26)
+    assert growth[WORTH].shape == (13, 27)
     assert all(len(optimizers[n].param_groups[0]["params"][0]) == 13 for n in PARAM_NAMES)
     narrower = params["scales"].detach()[3:8] < gaussians.scales[:5] - 0.1
     assert narrower.tolist() == [[False, True, False]] * 5

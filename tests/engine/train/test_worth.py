@@ -8,7 +8,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 
 from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.train.density.growing import APART, NARROWED
-from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, half_of, worth
+from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, half_of, share_seen, worth
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -99,6 +99,7 @@ def test_what_is_no_number_counts_for_nothing():
     add_picture(growth := {}, random_gaussians(4), 2, Judged(VIEWS[0], sums, torch.tensor(torch.inf)))
     found = growth[WORTH]
     assert bool(found.isfinite().all())
+    assert share_seen(growth) == 0.75
     assert found[1:3, :24].abs().max() == 0
     assert found[0, :24].abs().max() > 0
     assert found[:, 6:9].abs().max() == found[:, 11].abs().max() == 0  # surfels have two axes

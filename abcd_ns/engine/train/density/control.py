@@ -31,7 +31,7 @@ from abcd_ns.engine.train.density.pruning import (
     risen,
 )
 from abcd_ns.engine.train.density.relocation import compute_relocation
-from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, worth
+from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, share_seen, worth
 
 GATHER, REFINE = 1, 6
 """Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
@@ -41,7 +41,10 @@ REFINE_UNTIL = 0.5
 LEAST_REFINEMENTS = 4
 """Of a block in a whole run, however many views show it."""
 USUAL_REFINEMENTS, USUAL_VIEWS = 20, 100
-"""A block that few views show is refined every so many views, and at least so many times in a run."""
+"""A block that few views show is refined every so many views, and at least so many times in a run ..."""
+USUALLY_SEEN = 0.4
+"""... where a picture shows this share of its Gaussians or more. Where it shows less, they learn less from as
+many views, so that the block is refined less often."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MANY_VIEWS = 25
@@ -79,7 +82,8 @@ class DensityConfig:
     """Share of the run after which no Gaussian is split. A block in its first visit grows on until 0.7."""
     refine_every: int = 0
     """Views drawn to train a block between its refinements. 0: 100, fewer in a short run, which refines it 20
-    times. As many as show it if these are more, but no more than a quarter of those drawn while it grows."""
+    times; more where a picture shows less than 40% of the block. As many as show it if these are more, but no
+    more than a quarter of those drawn while it grows."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
 
@@ -122,6 +126,8 @@ class DensityClock:
     """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
     """Share of the visit that is done; 0 in the warm-up and where there are no other blocks."""
+    seen: float = 1.0
+    """Share of the block's Gaussians that a picture shows, in the mean."""
     visit: int | None = None
     """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
     show it."""
@@ -164,8 +170,9 @@ class DensityControl:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
         growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * clock.pace
-        usual = self.config.refine_every or min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
-        every = max(usual, min(views, int(growing / LEAST_REFINEMENTS)), 1)
+        usual = min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
+        wanted = max(views, int(usual * USUALLY_SEEN / max(clock.seen, 1e-9)))
+        every = max(self.config.refine_every or usual, min(wanted, int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
@@ -176,7 +183,9 @@ class DensityControl:
         Args:
             growth: the block's statistics, this step's included.
         """
-        return self.is_due(clock) and (self.config.strategy != "default" or WORTH in growth)
+        if self.config.strategy != "default" or not self.is_due(clock):
+            return self.is_due(clock)
+        return WORTH in growth and self.is_due(replace(clock, seen=share_seen(growth)))
 
     def asks(self, progress: float, first: bool) -> bool:
         """Whether growth is under way or to come: residuals are summed for it.
@@ -200,7 +209,7 @@ class DensityControl:
         infos: Infos,
         judged: Sequence[Judged],
         clock: DensityClock,
-    ) -> dict[str, Tensor]:
+    ) -> tuple[dict[str, Tensor], bool]:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
@@ -209,26 +218,28 @@ class DensityControl:
             judged: those of the step's pictures whose residuals were summed.
 
         Returns:
-            The block's statistics from now on. The global random generator is left as it was.
+            The block's statistics from now on, and whether it was refined. The global random generator is
+            left as it was.
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
-            return growth
+            return growth, False
         if self.config.strategy == "default":
             growth = added(growth, blend_sums(infos, clock.views))
             for picture in judged:
                 add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
             if not self.asks(clock.progress, clock.first):
                 growth.pop(WORTH, None)
-            if not self.refines(clock, growth):
-                return growth
+        refines = self.refines(clock, growth)
+        if self.config.strategy == "default" and not refines:
+            return growth, False
         device = params["means"].device
         cuda = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices=cuda), _operators_for(device):
             torch.manual_seed(clock.seed)
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
-                return {} if self.is_due(clock) else growth
-            return self._step_default(params, optimizers, growth, clock)
+                return ({} if refines else growth), refines
+            return self._step_default(params, optimizers, growth, clock), True
 
     def prune(
         self,

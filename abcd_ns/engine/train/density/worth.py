@@ -26,9 +26,9 @@ from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 WORTH = "worth"
-"""Name of the statistic, [n, 26]: b [axis, channel] and A [axis] of each half of the views, then sums over
-pictures of the error of a pixel and of 1."""
-BY_CHANNEL, BY_AXIS, COLUMNS = 9, 3, 26
+"""Name of the statistic, [n, 27]: b [axis, channel] and A [axis] of each half of the views, then sums over
+pictures of whether it shows, of the error of a pixel and of 1."""
+BY_CHANNEL, BY_AXIS, COLUMNS = 9, 3, 27
 """Columns of b, of A, and in all."""
 TINY = 1e-8
 """Added to A, which may be 0."""
@@ -69,6 +69,7 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
         _add_natively(table, start, gaussians, axes, picture, camera)
     else:
         table[:, start : start + BY_CHANNEL + BY_AXIS] += _asked(gaussians, axes, picture, camera)
+    table[:, -3] += picture.sums[:, 0] > 0
     table[:, -2] += picture.error.to(means).nan_to_num(0.0, 0.0, 0.0)
     table[:, -1] += 1
 
@@ -116,6 +117,16 @@ def _asked(
     return torch.where((weight > 0) & found.isfinite().all(dim=1, keepdim=True), found, 0.0)
 
 
+def share_seen(growth: Mapping[str, Tensor]) -> float:
+    """Of the Gaussians, the share that a picture shows, in the mean; an accelerator is waited for.
+
+    Args:
+        growth: with WORTH.
+    """
+    shows, _, pictures = growth[WORTH][:, -3:].sum(dim=0).tolist()
+    return shows / max(pictures, 1.0)
+
+
 def worth(
     growth: Mapping[str, Tensor], views: int, pixels: float
 ) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
@@ -127,7 +138,7 @@ def worth(
         views: that the block is trained on.
         pixels: with the mean error, that a split must remove as much of as they have.
     """
-    *halves, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1), dim=1)
+    *halves, _, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1, 1), dim=1)
     sums = [(halves[k].view(-1, BY_AXIS, 3), halves[k + 1][..., None]) for k in (0, 2)]
     gain = torch.zeros_like(sums[0][0])
     for (b, a), (others_b, others_a) in (sums, sums[::-1]):

@@ -123,8 +123,9 @@ class ActiveBlock:
         run = self._run
         for parameter in run.params.values():  # their memory is for what growth takes
             parameter.grad = None
-        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, judged, clock)
-        if run.density.refines(clock, self.growth):
+        given = run.params, run.optimizers, self.growth
+        self.growth, refined = run.density.after_step(*given, infos, judged, clock)
+        if refined:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.growth.pop(LARGEST, None)
         self._hold_sizes()
