@@ -95,13 +95,13 @@ def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
 
 
 def test_a_block_is_refined_less_often_where_a_picture_shows_little_of_it():
-    """As often for each Gaussian; but no less than four times in a run."""
-    control = DensityControl(DensityConfig())
+    """As often for each Gaussian; but no less than four times in a run, and never where a number is given."""
 
-    def every(seen: float, run: int = 20_000) -> int:
-        taken = range(1000, run)
+    def every(seen: float, run: int = 20_000, **changes) -> int:
+        taken, control = range(1000, run), DensityControl(DensityConfig(**changes))
         at = (clock(steps=n, progress=n / run, refined=999, views=5, seen=seen) for n in taken)
         return next(each.steps - each.refined for each in at if control.is_due(each))
 
     assert [every(seen) for seen in (1.0, 0.4, 0.2, 0.1)] == [100, 100, 200, 400]
+    assert every(0.1, refine_every=30) == 30
     assert every(0.001) == every(0.0) == int((0.5 - 1 / 60) * 20_000 / LEAST_REFINEMENTS)

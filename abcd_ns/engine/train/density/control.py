@@ -170,9 +170,9 @@ class DensityControl:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
         growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * clock.pace
-        usual = min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
-        wanted = max(views, int(usual * USUALLY_SEEN / max(clock.seen, 1e-9)))
-        every = max(self.config.refine_every or usual, min(wanted, int(growing / LEAST_REFINEMENTS)), 1)
+        given, usual = self.config.refine_every, min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
+        wanted = max(views, 0 if given else int(usual * USUALLY_SEEN / max(clock.seen, 1e-9)))
+        every = max(given or usual, min(wanted, int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
