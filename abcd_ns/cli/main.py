@@ -53,9 +53,6 @@ COMMANDS = (
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as triangles"),
     Command("compare", "abcd_ns.lab.compare.command:compare", "compare methods, numbers of blocks, options"),
     Command("stability", "abcd_ns.lab.stability.command:stability", "run small scenes on which methods fail"),
-    Command(
-        "completion", "abcd_ns.cli.completion:completion", "print a script that completes words in a shell"
-    ),
 )
 
 HELP = """usage: abcd COMMAND [OPTIONS]

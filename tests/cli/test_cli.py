@@ -1,7 +1,6 @@
 """The `abcd` command: what it prints, what it returns, and what it does not import."""
 
 import errno
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -139,15 +138,3 @@ def test_what_users_get_wrong_is_one_line_that_says_what_to_give(words, said, tm
     (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
     assert said in line
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_knows_commands_and_options(shell, capsys):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["completion", shell])
-    assert not ended.value.code
-    script = capsys.readouterr().out
-    assert "compare" in script
-    assert "--max-gaussians" in script
-    if shutil.which(shell):
-        subprocess.run([shell, "-n"], input=script, text=True, check=True)
