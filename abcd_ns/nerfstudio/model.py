@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -46,7 +47,7 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
 
 
-@shown("rasterizer", "random_init")
+@shown("rasterizer", "init_splats")
 @hidden(*HIDDEN)
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
@@ -57,6 +58,8 @@ class AbcdModelConfig(SplatfactoModelConfig):
     """gsplat: CUDA kernels. torch: any device. auto takes gsplat on CUDA devices."""
     random_init: bool = False
     """Start with Gaussians at random places instead of the points."""
+    init_splats: Path | None = None
+    """Start with the Gaussians of a .ply file, in the frame of the photos' poses, instead of the points."""
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import takewhile
 from operator import attrgetter
@@ -17,6 +18,7 @@ from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
+from abcd_ns.engine.train.schedule import DECAY_VIEWS
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
@@ -221,6 +223,9 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
     refuse_changed(model, unused, "pipeline.model.")
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
+    if model.init_splats is not None:  # trained already, on whole pictures
+        training.warmup = training.coarse = 0.0
+        training.recipe = replace(training.recipe, sh_ramp=0.0, trained_before=DECAY_VIEWS)
     if training.light != "none":  # held-out photos have a light of their own, too
         model.color_corrected_metrics = True
     defaults = type(model)()

@@ -13,13 +13,14 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 
 from abcd_ns.data.input_errors import say
-from abcd_ns.data.ply import GREY
+from abcd_ns.data.ply import GREY, read_gaussians
 from abcd_ns.engine.events import HeldOutScored
+from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.initialize import PointCloud, random_points
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.types import View
+from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.flags import as_a_command, check_box, check_held_out, check_tool, opened, shown
@@ -205,9 +206,11 @@ class AbcdPipeline(VanillaPipeline):
         manager.device_photo_bytes = photo_bytes(self.config, self.device)
         first = partial(self._first_cloud, views)
         photos, factor = manager.train_dataset.image_filenames, factor_of(manager.dataparser)
+        elsewhere = model.config.random_init or model.config.init_splats is not None
+        points = 0 if elsewhere else len(self._cloud[0])
         return begin_run(
             self.config,
-            Capture(views, photos, manager.target, first, len(self._cloud[0]), factor),
+            Capture(views, photos, manager.target, first, points, factor),
             self.device,
             trainer.folder / STORE,
             Budget(trainer.total_steps, self.config.max_seconds),
@@ -228,9 +231,18 @@ class AbcdPipeline(VanillaPipeline):
         """Points of the capture and their colours; none where it has none."""
         return self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
 
-    def _first_cloud(self, views: list[View]) -> PointCloud:
-        """At the points of the capture or, as splatfacto's, at random places."""
+    def _first_cloud(self, views: list[View]) -> PointCloud | Gaussians:
+        """Those of a file, or at the points of the capture or, as splatfacto's, at random places."""
         model, training, (points, colors) = self.model.config, self.config.training, self._cloud
+        if model.init_splats is not None:
+            read = self.datamanager.train_dataparser_outputs
+            to, found = (
+                Frame.of(read.dataparser_transform, read.dataparser_scale),
+                read_gaussians(model.init_splats),
+            )
+            say(f"Starting with {len(found):,} Gaussians of {model.init_splats}.")
+            to = Frame.of(read.dataparser_transform, read.dataparser_scale)
+            return to.gaussians(found).of_degree(training.sh_degree)
         if len(points) and not model.random_init:
             if len(colors) != len(points):  # as of a .ply without colours
                 colors = torch.full_like(points, GREY)

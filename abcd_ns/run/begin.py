@@ -31,7 +31,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.types import View
+from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_blocks, independent_trainer
@@ -68,8 +68,8 @@ class Capture:
     """Their photos; a run resumes on photos of the same names and sizes alone."""
     target: Callable[[Sample], Target]
     """Gives what a sample is trained on."""
-    cloud: Callable[[], PointCloud]
-    """Makes what a new run begins with."""
+    cloud: Callable[[], PointCloud | Gaussians]
+    """Makes what a new run begins with: Gaussians, which are trained already, where there is no warm-up."""
     points: int
     """That the capture has; 0 where the run begins with others."""
     factor: int = 1
@@ -251,7 +251,7 @@ def _new_store(
     return store
 
 
-def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointCloud:
+def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointCloud | Gaussians:
     """No more than the scene may have."""
     everything, points = capture.cloud(), capture.points
     if len(everything) < points:

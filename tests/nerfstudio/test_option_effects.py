@@ -61,6 +61,7 @@ ELSEWHERE = {
     "pipeline.ram_budget_gb", "pipeline.datamanager.photo_cache_gb",  # of memory alone
     "pipeline.max_seconds",  # test_training.py
     "pipeline.model.num_random", "pipeline.model.random_scale",  # of `random_init`
+    "pipeline.model.init_splats",  # test_init_splats.py
     "pipeline.model.render", "pipeline.model.rasterizer", "pipeline.model.color_corrected_metrics",
     "machine.device_type",
     "pipeline.datamanager.data", f"{DATA}data",  # as `data`

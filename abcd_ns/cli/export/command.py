@@ -93,7 +93,7 @@ def to_data(run: Path) -> Frame:
     try:
         found = json.loads(path.read_text())
         matrix = torch.tensor(found["transform"], dtype=torch.float64).reshape(3, 4)
-        return Frame(matrix[:, :3], matrix[:, 3], float(found["scale"])).inverse
+        return Frame.of(matrix, found["scale"]).inverse
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} cannot be read ({error}); use --frame nerfstudio.") from None
 

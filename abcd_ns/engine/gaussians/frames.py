@@ -25,6 +25,12 @@ class Frame:
     """Before scaling; float64."""
     scale: float
 
+    @staticmethod
+    def of(transform: Float[Tensor, "3 4"], scale: float) -> "Frame":
+        """Of a dataparser: its transform, and the scale after that."""
+        matrix = transform.double()
+        return Frame(matrix[:, :3], matrix[:, 3], float(scale))
+
     @property
     def inverse(self) -> "Frame":
         """The way back."""

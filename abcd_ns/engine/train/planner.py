@@ -79,7 +79,7 @@ class Visits(Protocol):
 def views_of_step(config: TrainingConfig, blocks: int, trained: int) -> int:
     """Views in a step of a block that was trained on so many, one of several: fewer while it is
     under-trained, where its steps are larger for that."""
-    known = trained if config.recipe.fast_start else None
+    known = trained + config.recipe.trained_before if config.recipe.fast_start else None
     return views_per_step(config.batch, blocks, known)
 
 

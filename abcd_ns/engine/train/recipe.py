@@ -58,6 +58,8 @@ class Recipe:
     fast_start: bool = True
     """Learning rates are larger while a block was trained on few views, see
     `param_swap.rates_of_under_trained`, and fall at the end of the run, see `schedule.final_decay`."""
+    trained_before: int = 0
+    """Views that every block counts as trained on when the run begins."""
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ class VisitTraining:
         decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
         decays = run.config.recipe.fast_start and (run.active.is_joint or self.block.clocks.visits > 0)
-        trained = self.block.clocks.adam_views
+        trained = self.block.clocks.adam_views + run.config.recipe.trained_before
         damping = final_decay(run.progress, trained) if decays else 1.0
         self._pace.set(self.batch, trained, decay, damping)
         step, first = run.state.step, run.active.done * self.batch

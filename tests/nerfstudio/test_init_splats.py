@@ -1,0 +1,118 @@
+"""A run that begins with the Gaussians of a .ply file: `--pipeline.model.init-splats`."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from abcd_ns.cli.export.command import export
+from abcd_ns.data.ply import read_gaussians
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.formats.ply import columns, write_ply
+from tests.nerfstudio.crash_training import gaussians
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.scenes import random_gaussians
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> tuple[dict[str, torch.Tensor], Path]:
+    """A short run's scene, and its file in the frame of the poses."""
+    folder = tmp_path_factory.mktemp("trained")
+    found, file = run(configure(data, folder, steps=6)), folder / "scene.ply"
+    export(found.base_dir, out=file)
+    return sorted_rows(gaussians(found.base_dir)), file
+
+
+def sorted_rows(scene: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """By name of the parameter; Gaussians by their places."""
+    values = {name.rpartition(".")[2]: value for name, value in scene.items()}
+    values["quats"] = torch.nn.functional.normalize(values["quats"], dim=1)
+    order = (values["means"] @ torch.tensor([1.0, 2.0, 3.0])).argsort()
+    return {name: value[order] for name, value in values.items()}
+
+
+def start_from(file: Path, data: Path, out: Path, blocks: int = 3, steps: int = 1):
+    config = configure(data, out, steps=steps, blocks=blocks)
+    config.pipeline.model.init_splats = file
+    return config
+
+
+def test_a_run_begins_where_the_file_ended(data, trained, tmp_path):
+    expected, file = trained
+    config = start_from(file, data, tmp_path)
+    config.pipeline.training.density.strategy = "off"
+    for group in config.optimizers.values():
+        group["optimizer"].lr = 0.0
+    found = sorted_rows(gaussians(run(config).base_dir))
+    signs = (found["quats"] * expected["quats"]).sum(dim=1, keepdim=True).sign()
+    found["quats"] = found["quats"] * signs
+    for name in PARAM_NAMES:
+        assert torch.allclose(found[name], expected[name], atol=2e-5), name
+
+
+def test_it_learns_grows_and_resumes(data, trained, tmp_path):
+    _, file = trained
+    first = run(start_from(file, data, tmp_path, steps=40), stop_after=25)
+    config = start_from(tmp_path / "gone.ply", data, tmp_path / "more", steps=40)
+    config.load_dir = first.checkpoint_dir
+    whole, resumed = run(start_from(file, data, tmp_path / "whole", steps=40)), run(config)
+    expected, found = gaussians(whole.base_dir), gaussians(resumed.base_dir)
+    assert all(torch.equal(value, found[name]) for name, value in expected.items())
+
+
+def test_what_writers_put_down_is_read(tmp_path):
+    written = random_gaussians(5, sh_degree=2)
+    written.opacities[0] = torch.inf  # quite opaque
+    written.scales[1, 2] = -torch.inf  # flat
+    written.means[2, 0], written.quats[3] = torch.nan, 0.0
+    file = tmp_path / "scene.ply"
+    write_ply(file, 5, 2, [written])
+    found = read_gaussians(file)
+    assert found.sh_degree == 2
+    assert torch.equal(found.means, written.means[[0, 1, 4]])
+    assert torch.equal(found.features_rest, written.features_rest[[0, 1, 4]])
+    assert float(found.opacities[0].sigmoid()) == pytest.approx(1)
+    assert float(found.scales[1, 2].exp()) == pytest.approx(0, abs=1e-8)
+
+
+def points_alone(file: Path) -> None:
+    rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    file.write_bytes(head.encode() + rows.tobytes())
+
+
+def odd_harmonics(file: Path) -> None:
+    names = [*columns(0), "f_rest_0", "f_rest_1"]
+    head = "".join(f"property float {name}\n" for name in names)
+    file.write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{head}end_header\n")
+
+
+def cut_short(file: Path) -> None:
+    write_ply(file, 9, 0, [Gaussians.empty(0)])
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (lambda _: None, "does not exist"),
+        (points_alone, "lacks scale_0"),
+        (odd_harmonics, "has 2 harmonics f_rest"),
+        (cut_short, "claims 9 points"),
+        (lambda file: file.write_bytes(b""), "is not a .ply file"),
+        (lambda file: write_ply(file, 5, 0, [random_gaussians(5, sh_degree=0)]), "max-gaussians is 3"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(data, tmp_path, capsys, write, reason):
+    file = tmp_path / "scene.ply"
+    write(file)
+    config = start_from(file, data, tmp_path / "out")
+    config.pipeline.training.density.max_gaussians = 3
+    with pytest.raises(SystemExit) as stopped:
+        run(config)
+    said = capsys.readouterr()
+    assert stopped.value.code == 2
+    lines = (said.out + said.err).splitlines()
+    assert any(str(file) in line and reason in line for line in lines)
+    assert not (tmp_path / "out").exists()
