@@ -7,9 +7,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 
 from abcd_ns.data.dataset import PHOTOS, has_views, with_photos
 from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.ply import count_gaussians
 from abcd_ns.data.prepare import check_masks
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
+from abcd_ns.nerfstudio.model import AbcdModelConfig
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,26 @@ def inspect(config: DataParserConfig) -> Inspected:
     train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
     points = len(parts[0].metadata.get("points3D_xyz", ()))
     return Inspected(train, held_out, largest, points, factor_of(parser))
+
+
+def splats_to_begin_with(model: AbcdModelConfig, most: int | None) -> int:
+    """Gaussians of the file that a run begins with; 0 without one.
+
+    Args:
+        most: that the scene may have; None for any number.
+
+    Raises:
+        UserError: the file cannot be read, or has more.
+    """
+    if (path := model.init_splats) is None:
+        return 0
+    if model.random_init:
+        raise UserError("Give --pipeline.model.init-splats or --pipeline.model.random-init, not both.")
+    count = count_gaussians(path)
+    if most is not None and count > most:
+        limit = f"--pipeline.training.density.max-gaussians is {most:,}"
+        raise UserError(f"{path} has {count:,} Gaussians, but {limit}: raise it.")
+    return count
 
 
 def where_data_is(data: Path | None, config: Path) -> Path | None:

@@ -17,14 +17,13 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error, say
-from abcd_ns.data.ply import count_gaussians
 from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkersSeen
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, hidden, opened, shown
-from abcd_ns.nerfstudio.inspection import Inspected, inspect
+from abcd_ns.nerfstudio.inspection import Inspected, inspect, splats_to_begin_with
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.resuming import check_start, find_start, has_begun, pin_name
@@ -145,35 +144,19 @@ class AbcdTrainerConfig(TrainerConfig):
             start, model = find_start(self), self.pipeline.model
             check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
-            splats = 0 if start or model.init_splats is None else self._count_splats()
+            splats = 0 if start else splats_to_begin_with(model, self.pipeline.training.density.limit)
             found = inspect(self.pipeline.datamanager.reader())
             say(found.in_words())
             if self.pipeline.blocks == 0:
                 self._check_fit(found, splats)
 
-    def _count_splats(self) -> int:
-        """Gaussians of the file that the run begins with.
-
-        Raises:
-            UserError: it cannot be read, or holds more than the scene may have.
-        """
-        path, most = self.pipeline.model.init_splats, self.pipeline.training.density.limit
-        if self.pipeline.model.random_init:
-            raise UserError("Give --pipeline.model.init-splats or --pipeline.model.random-init, not both.")
-        if (count := count_gaussians(path)) > (most or count):
-            raise UserError(
-                f"{path} has {count:,} Gaussians, and --pipeline.training.density.max-gaussians is {most:,}: "
-                "raise it."
-            )
-        return count
-
     def _check_fit(self, found: Inspected, splats: int) -> None:
         """See that some block fits on the device."""
         pipeline, model = self.pipeline, self.pipeline.model
-        points = splats or (model.num_random if model.random_init else found.points)
+        points = splats or (0 if model.random_init else found.points) or model.num_random
         device = self.machine.device_type
         most, of_photos = pipeline.training.density.limit, {"factor": found.factor, "on_cpu": device == "cpu"}
-        demand = Demand(found.pixels, points or model.num_random, pipeline.training, most, **of_photos)
+        demand = Demand(found.pixels, points, pipeline.training, most, **of_photos)
         find_fit(device_budget(pipeline.device_budget_gb, device), demand)
 
 
