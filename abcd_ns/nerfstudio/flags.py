@@ -199,7 +199,7 @@ class AbcdMachineConfig(MachineConfig):
     """nerfstudio's machine; its seed is the run's."""
 
     seed: int = 0
-    """Seed of the order of blocks and views, of backgrounds, and of `mcmc`."""
+    """Seed of the order of blocks and views, and of backgrounds."""
 
 
 @shown("websocket_port", "websocket_host", "quit_on_train_completion")

@@ -14,7 +14,6 @@ blocks with moments and gradients lie in RAM. It costs one more drawing than joi
 way to the device and back.
 """
 
-import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -147,7 +146,7 @@ class ExactTrainer(Trainer):
         updated, rows = [], []
         for block in owner.unique().tolist():
             rows.append((owner == block).nonzero()[:, 0])
-            updated.append(self._step(block, self._all[rows[-1]], gradients, rows[-1], taken))
+            updated.append(self._step(self._all[rows[-1]], gradients, rows[-1], taken))
         joined, order = join(updated), torch.cat(rows)
         kept = all(len(state) == len(row) for state, row in zip(updated, rows, strict=True))
         self._all = joined[order.argsort()] if kept else joined
@@ -237,18 +236,16 @@ class ExactTrainer(Trainer):
         picture.backward(self._pictures[place].grad)
 
     def _step(
-        self, block: int, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int
+        self, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int
     ) -> BlockState:
         attach(state.to(self.device), self.params, self.optimizers, batch=taken)
         for name in PARAM_NAMES:
             self.params[name].grad = gradients.params[name][rows].to(self.device)
-        if self.config.density.strategy == "mcmc":
-            self.run.density.regularisation(self.params, self.count()).backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
         steps, views = state.clocks.steps + taken, state.clocks.adam_views + taken
         clocks = replace(state.clocks, steps=steps, adam_views=views)
-        clock = self._clock_of(block, len(state), clocks, taken)
+        clock = self._clock_of(len(state), clocks, taken)
         growth, refined = self.run.density.after_step(
             self.params,
             self.optimizers,
@@ -276,9 +273,8 @@ class ExactTrainer(Trainer):
             for sample, own, residual in zip(self._batch.samples, sums, self._residuals, strict=True)
         ]
 
-    def _clock_of(self, block: int, gaussians: int, clocks: Clocks, taken: int) -> DensityClock:
+    def _clock_of(self, gaussians: int, clocks: Clocks, taken: int) -> DensityClock:
         limit, everything = self.config.density.limit, max(self.count(), 1)
-        drawn = random.Random(f"density {self.config.seed} {self.state.step} {block}")
         return DensityClock(
             progress=self.progress,
             steps=clocks.steps,
@@ -286,5 +282,4 @@ class ExactTrainer(Trainer):
             views=len(self.views),
             refined=clocks.refined,
             room=None if limit is None else max(limit - everything, 0) * gaussians // everything,
-            seed=drawn.getrandbits(62),
         )

@@ -53,8 +53,7 @@ def train_plain(
         loss.backward()
         for optimizer in adam.values():
             optimizer.step()
-        seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
-        clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed, refined=refined)
+        clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, refined=refined)
         judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
         judged = [judged] if density.asks(taken / steps, first=False) else []
         growth, refines = density.after_step(params, adam, growth, (raster.info,), judged, clock)

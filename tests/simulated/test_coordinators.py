@@ -19,7 +19,6 @@ from tests.reference.simulated_device import DEVICE
 
 OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
 GROWING = DensityConfig(**OFTEN, split_pixels=0.0)
-MCMC = DensityConfig(**OFTEN, strategy="mcmc", max_gaussians=160)
 
 
 @pytest.fixture
@@ -41,11 +40,11 @@ APART = {"kind": independent_trainer, "content": independent_blocks, "layers": F
     ("blocks", "steps", "options"),
     [
         (1, 8, {}),
-        (4, 16, {"density": MCMC, "layers": False}),
+        (4, 16, {"density": GROWING, "layers": False}),
         (3, 8, {"kind": ExactTrainer}),
         (2, 6, {**APART, "overlap": 0.25}),
     ],
-    ids=["one", "four-mcmc-ablated", "jointly", "apart"],
+    ids=["one", "four-ablated", "jointly", "apart"],
 )
 def test_blocks_are_trained(on_device, start, photos, blocks, steps, options):
     coordinator = on_device(blocks=blocks, steps=steps, **{"density": GROWING, **options})

@@ -54,7 +54,7 @@ class TrainingConfig:
     """Seconds of the run that a kill may cost; blocks are written to disk beside the training.
     0 commits at the end of every visit, which waits for the disk."""
     seed: int = 0
-    """Seed of the order of blocks and views, of backgrounds, and of `mcmc`."""
+    """Seed of the order of blocks and views, and of backgrounds."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 

@@ -131,15 +131,13 @@ class VisitTraining:
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """What a batch adds to the loss of a step: photometric over what of the crops says something about
-        the block, the mean of the samples', plus what the density strategy adds."""
+        the block, the mean of the samples'."""
         run = self.run
         pictures, photos = self._visits.compared(batch, pictures, photos)
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         self._rendered = None
         losses = batch.losses(pictures, photos, run.config)
         loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
-        if run.config.density.strategy == "mcmc":
-            loss = loss + run.density.regularisation(run.params, run.count())
         return loss if batch.share == 1 else loss * batch.share
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:

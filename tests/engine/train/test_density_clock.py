@@ -16,9 +16,7 @@ from abcd_ns.engine.train.density.control import (
 
 
 def clock(**changes) -> DensityClock:
-    return DensityClock(
-        **{"progress": 0.2, "steps": 100, "taken": 1, "views": 5, "room": None, "seed": 1, **changes}
-    )
+    return DensityClock(**{"progress": 0.2, "steps": 100, "taken": 1, "views": 5, "room": None, **changes})
 
 
 def refinements(run: int, views: int, taken: int = 1, **changes) -> list[int]:

@@ -204,10 +204,10 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
         train_step(coordinator, photos)
 
 
-@pytest.mark.parametrize(("blocks", "strategy"), [(1, "default"), (3, "mcmc")])
-def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks, strategy):
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks):
     """All its Gaussians may be pruned; the run goes on, and can be resumed."""
-    density = DensityConfig(strategy, refine_start=0.0)
+    density = DensityConfig(refine_start=0.0)
     options = {"blocks": blocks, "steps": 30, "density": density}
     coordinator = make(**options)
     train(coordinator, photos, steps=2)

@@ -27,7 +27,7 @@ OTHERS = {
     "seed": 1,
 }
 OTHERS_OF_DENSITY = {
-    "strategy": "mcmc",
+    "strategy": "off",
     "max_gaussians": 125,
     "min_contribution": 0.0,
     "split_pixels": 1e4,

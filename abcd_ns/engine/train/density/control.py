@@ -1,18 +1,15 @@
 """Growing and pruning the active block, on the block's own clock.
 
-The default strategy splits what is worth it (see `worth`) and takes out what fills little (see `pruning`);
-MCMC is gsplat's own. gsplat's strategies keep a schedule in absolute steps of one global run.
-Here the schedule is in shares of the run and in the block's own steps, so it is kept in this file.
+What is worth it is split (see `worth`), and what fills little goes (see `pruning`). gsplat's strategies keep
+a schedule in absolute steps of one global run. Here it is in shares of the run and in the block's own steps.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from gsplat.strategy import MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
 from jaxtyping import Float
 from torch import Tensor
@@ -30,11 +27,7 @@ from abcd_ns.engine.train.density.pruning import (
     have_contributions,
     risen,
 )
-from abcd_ns.engine.train.density.relocation import compute_relocation
 from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, share_seen, worth
-
-GATHER, REFINE = 1, 6
-"""Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
 
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
@@ -49,12 +42,6 @@ MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MANY_VIEWS = 25
 """Of fewer, what a Gaussian contributes sums up to less: the minimum is in proportion to them."""
-MCMC_MIN_OPACITY = 0.005
-MCMC_DEFAULT_CAP = 1_000_000
-MCMC_NOISE_LR = 5e5
-"""Strength of the exploration noise."""
-MCMC_OPACITY_REG, MCMC_SCALE_REG = 0.01, 0.01
-"""Weights of the mean opacity and of the mean standard deviation in the loss."""
 
 
 Infos = tuple[dict[str, Any], ...]
@@ -65,14 +52,14 @@ Infos = tuple[dict[str, Any], ...]
 class DensityConfig:
     """When and how the number of Gaussians changes."""
 
-    strategy: Literal["default", "mcmc", "off"] = "default"
-    """default: split by error, and prune. mcmc: relocate, and add up to a limit (3DGS-MCMC)."""
+    strategy: Literal["default", "off"] = "default"
+    """default: split by error, and prune. off: neither."""
     max_gaussians: int = 0
-    """Limit for the whole scene. 0 is none (mcmc: 1,000,000). Of more points, a random choice starts."""
+    """Limit for the whole scene. 0 is none. Of more points, a random choice starts."""
     min_contribution: float = 8.0
     """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
-    Applies once growth ends. Of n < 25 training views it is n / 25 of this. Strategy mcmc has the final
-    pruning only. 0 turns all pruning by contribution off, of floaters too, and the final pruning."""
+    Applies once growth ends. Of n < 25 training views it is n / 25 of this. 0 turns all pruning by
+    contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
     """Split a Gaussian if that removes as much squared error as this many average pixels have.
     Both count in all views of its block. A refinement splits a tenth of the block at most."""
@@ -85,7 +72,7 @@ class DensityConfig:
     times; more where a picture shows less than 40% of the block. As many as show it if these are more, but no
     more than a quarter of those drawn while it grows."""
     cull_alpha_thresh: float = 0.005
-    """Opacity under which a Gaussian is pruned (`default` strategy)."""
+    """Opacity under which a Gaussian is pruned."""
 
     @property
     def prunes_at_end(self) -> bool:
@@ -99,9 +86,7 @@ class DensityConfig:
     @property
     def limit(self) -> int | None:
         """Gaussians in the whole scene at most, or None."""
-        if self.max_gaussians > 0:
-            return self.max_gaussians
-        return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
+        return self.max_gaussians or None
 
 
 @dataclass(frozen=True)
@@ -118,8 +103,6 @@ class DensityClock:
     """Views that the block is trained on."""
     room: int | None
     """Gaussians that may still be added to the scene; None for no limit."""
-    seed: int
-    """Of the random numbers drawn in this step."""
     refined: int = 0
     """`steps` when the block was last refined."""
     first: bool = False
@@ -147,18 +130,11 @@ class DensityControl:
 
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
         self.config, self._axes = config, primitive.axes
-        self._state = MCMCStrategy().initialize_state() if config.strategy == "mcmc" else {}
 
     @property
     def wants_weights(self) -> bool:
         """Whether the rasterizer must leave `weights`."""
         return self.config.strategy == "default" and self.config.min_contribution > 0
-
-    def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
-        """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
-        opacity = torch.sigmoid(params["opacities"]).sum()
-        scale = torch.exp(params["scales"]).sum() / 3
-        return (MCMC_OPACITY_REG * opacity + MCMC_SCALE_REG * scale) / max(scene_gaussians, 1)
 
     def is_due(self, clock: DensityClock) -> bool:
         """Whether this step refines."""
@@ -178,14 +154,14 @@ class DensityControl:
         return every
 
     def refines(self, clock: DensityClock, growth: Mapping[str, Tensor]) -> bool:
-        """Whether this step refines: it is due, and by default there is something to judge by.
+        """Whether this step refines: it is due, and there is something to judge by.
 
         Args:
             growth: the block's statistics, this step's included.
         """
-        if self.config.strategy != "default" or not self.is_due(clock):
-            return self.is_due(clock)
-        return WORTH in growth and self.is_due(replace(clock, seen=share_seen(growth)))
+        if not self.is_due(clock) or WORTH not in growth:
+            return False
+        return self.is_due(replace(clock, seen=share_seen(growth)))
 
     def asks(self, progress: float, first: bool) -> bool:
         """Whether growth is under way or to come: residuals are summed for it.
@@ -218,28 +194,18 @@ class DensityControl:
             judged: those of the step's pictures whose residuals were summed.
 
         Returns:
-            The block's statistics from now on, and whether it was refined. The global random generator is
-            left as it was.
+            The block's statistics from now on, and whether it was refined.
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth, False
-        if self.config.strategy == "default":
-            growth = added(growth, blend_sums(infos, clock.views))
-            for picture in judged:
-                add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
-            if not self.asks(clock.progress, clock.first):
-                growth.pop(WORTH, None)
-        refines = self.refines(clock, growth)
-        if self.config.strategy == "default" and not refines:
+        growth = added(growth, blend_sums(infos, clock.views))
+        for picture in judged:
+            add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
+        if not self.asks(clock.progress, clock.first):
+            growth.pop(WORTH, None)
+        if not self.refines(clock, growth):
             return growth, False
-        device = params["means"].device
-        cuda = [device] if device.type == "cuda" else []
-        with torch.random.fork_rng(devices=cuda), _operators_for(device):
-            torch.manual_seed(clock.seed)
-            if self.config.strategy == "mcmc":
-                self._step_mcmc(params, optimizers, clock)
-                return ({} if refines else growth), refines
-            return self._step_default(params, optimizers, growth, clock), True
+        return self._refined(params, optimizers, growth, clock), True
 
     def prune(
         self,
@@ -271,7 +237,7 @@ class DensityControl:
             gsplat_ops.remove(params, optimizers, growth, drop)
         return growth
 
-    def _step_default(
+    def _refined(
         self, params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clock: DensityClock
     ) -> dict[str, Tensor]:
         config = self.config
@@ -285,43 +251,8 @@ class DensityControl:
             gsplat_ops.remove(params, optimizers, growth, faint)
         return growth
 
-    def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
-        room = len(params["means"]) if clock.room is None else clock.room
-        strategy = MCMCStrategy(
-            cap_max=len(params["means"]) + max(room, 0),
-            noise_lr=MCMC_NOISE_LR,
-            refine_start_iter=0,
-            refine_every=REFINE,
-            min_opacity=MCMC_MIN_OPACITY,
-        )
-        # gsplat puts the dead where some are alive, and fails where none is.
-        alive = self.is_due(clock) and bool((params["opacities"].sigmoid() > MCMC_MIN_OPACITY).any())
-        step = REFINE if alive else GATHER
-        learning_rate = optimizers["means"].param_groups[0]["lr"]
-        strategy.step_post_backward(params, optimizers, self._state, step, {}, lr=learning_rate)
-
 
 def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Statistics of more drawings added to a block's."""
     sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
     return {**growth, **sums}
-
-
-@contextmanager
-def _operators_for(device: torch.device) -> Iterator[None]:
-    """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call. And
-    it gives back the allocator's memory after each refinement, only to ask for it anew: it had better not."""
-    replaced: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
-    if device.type != "cuda":
-        from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci  # private: asked of nobody else
-
-        replaced.append((gsplat_ops, "compute_relocation", compute_relocation))
-        replaced.append((gsplat_ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci))
-    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
-    try:
-        for each in replaced:
-            setattr(*each)
-        yield
-    finally:
-        for each in originals:
-            setattr(*each)

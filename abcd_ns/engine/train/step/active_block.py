@@ -1,6 +1,5 @@
 """The block that is being trained: its way in and out of the optimizers, its growth, and its clocks."""
 
-import random
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -196,7 +195,6 @@ class ActiveBlock:
             views=len(active.trained_on),
             visit=active.steps * batch if blocks > 1 else None,
             room=room,
-            seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
             refined=self.clocks.refined,
             first=among_others and self.clocks.visits == 0,
             spent=active.done / active.steps if among_others else 0.0,
