@@ -224,7 +224,7 @@ def _read_photo(source: PhotoSource) -> Tensor:
 
 def _read_mask(source: PhotoSource) -> Tensor:
     mask = _decode(source.mask_path, visible)[..., None]
-    width, height = source.reduced
+    width, height = source.stored
     if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
         shape = f"{mask.shape[1]} x {mask.shape[0]} px"
         raise InputError(f"{source.mask_path}: {shape}, unlike its photo ({width} x {height}); replace it.")

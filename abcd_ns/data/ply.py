@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.types import Gaussians
@@ -52,14 +54,23 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return xyz, _colors(points)
 
 
-def count_gaussians(path: Path) -> int:
-    """How many a .ply file has, by its header; raises as `read_gaussians`."""
-    return len(_rows(path)[0])
+def some_means(path: Path, most: int) -> tuple[int, Float64[Tensor, "n 3"]]:
+    """How many Gaussians a .ply file has, and the means of up to so many, evenly spaced; raises as
+    `read_gaussians`."""
+    rows, groups = _rows(path)
+    some = rows[:: -(-len(rows) // most)]
+    return len(rows), _columns(some, groups["means"]).double()
 
 
-def read_gaussians(path: Path) -> Gaussians:
-    """The Gaussians of a .ply file as 3DGS, `abcd export` and other trainers write it. Rows that hold NaN, or
-    no rotation, are left out.
+def is_antialiased(path: Path) -> bool:
+    """Whether a .ply file says so, as `abcd export` marks it."""
+    with path.open("rb") as file:
+        return b"\ncomment antialiased\n" in file.read(_MAX_HEADER)
+
+
+def read_gaussians(path: Path) -> tuple[Gaussians, int]:
+    """The Gaussians of a .ply file as 3DGS, `abcd export` and other trainers write it; and how many rows are
+    left out, since they hold NaN, or no rotation.
 
     Raises:
         InputError: the file cannot be read, or lacks one of their properties.
@@ -71,13 +82,14 @@ def read_gaussians(path: Path) -> Gaussians:
     sound = torch.stack([value.isfinite().all(dim=1) for value in found.values()]).all(dim=0)
     sound &= found["quats"].norm(dim=1) > 0
     found["features_rest"] = found["features_rest"].unflatten(1, (3, -1)).transpose(1, 2).contiguous()
-    return Gaussians(**found)[sound]
+    return Gaussians(**found)[sound], int((~sound).sum())
 
 
 def _rows(path: Path) -> tuple[np.ndarray, dict[str, list[str]]]:
     """A row for each Gaussian, and by parameter the names of its columns."""
     if not path.is_file():
-        raise InputError(f"{path} does not exist; correct --pipeline.model.init-splats.")
+        lacks = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{path} {lacks}; correct --pipeline.model.init-splats.")
     fix = "--pipeline.model.init-splats wants a .ply of Gaussians, as `abcd export` writes it"
     rows = _vertices(path, fix)
     present = rows.dtype.names
@@ -94,10 +106,12 @@ def _rows(path: Path) -> tuple[np.ndarray, dict[str, list[str]]]:
     if missing or rest not in _RESTS:
         lacks = f"lacks {missing[0]}" if missing else f"has {rest} harmonics f_rest, not 0, 9, 24 or 45"
         raise InputError(f"{path} {lacks}; {fix}.")
+    if not len(rows):
+        raise InputError(f"{path} has no Gaussians; {fix}.")
     return rows, groups
 
 
-def _columns(rows: np.ndarray, names: list[str]) -> torch.Tensor:
+def _columns(rows: np.ndarray, names: list[str]) -> Tensor:
     """float32 [n, c]."""
     found = np.empty((len(rows), len(names)), np.float32)
     for place, name in enumerate(names):

@@ -1,17 +1,26 @@
 """What there is to train on, read and checked before a run begins."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float64
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig
+from scipy.spatial import cKDTree
+from torch import Tensor
 
 from abcd_ns.data.dataset import PHOTOS, has_views, with_photos
-from abcd_ns.data.input_errors import InputError
-from abcd_ns.data.ply import count_gaussians
+from abcd_ns.data.input_errors import InputError, say
+from abcd_ns.data.ply import is_antialiased, some_means
 from abcd_ns.data.prepare import check_masks
+from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
 from abcd_ns.nerfstudio.model import AbcdModelConfig
+
+SOME_MEANS = 1000
+"""Of a file's Gaussians, that are looked for among the points."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,10 @@ class Inspected:
     """0 where Gaussians begin at random."""
     factor: int
     """By which the photos' width and height are divided."""
+    cloud: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), compare=False)
+    """The points, in the run's frame, [n, 3]."""
+    to_run: Frame | None = field(default=None, compare=False)
+    """From the frame of the photos' poses."""
 
     @property
     def pixels(self) -> int:
@@ -57,28 +70,40 @@ def inspect(config: DataParserConfig) -> Inspected:
     check_masks(sources)
     largest = max((source.size for source in sources), key=lambda size: size[0] * size[1])
     train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
-    points = len(parts[0].metadata.get("points3D_xyz", ()))
-    return Inspected(train, held_out, largest, points, factor_of(parser))
+    cloud = np.asarray(parts[0].metadata.get("points3D_xyz", np.zeros((0, 3))))
+    to_run = Frame.of(parts[0].dataparser_transform, parts[0].dataparser_scale)
+    return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run)
 
 
-def splats_to_begin_with(model: AbcdModelConfig, most: int | None) -> int:
+def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found: Inspected) -> int:
     """Gaussians of the file that a run begins with; 0 without one.
 
-    Args:
-        most: that the scene may have; None for any number.
-
     Raises:
-        UserError: the file cannot be read, or has more.
+        UserError: it cannot be read, has more than the scene may have, or lies elsewhere than the points.
     """
     if (path := model.init_splats) is None:
         return 0
     if model.random_init:
         raise UserError("Give --pipeline.model.init-splats or --pipeline.model.random-init, not both.")
-    count = count_gaussians(path)
+    (count, means), most = some_means(path, SOME_MEANS), training.density.limit
     if most is not None and count > most:
         limit = f"--pipeline.training.density.max-gaussians is {most:,}"
         raise UserError(f"{path} has {count:,} Gaussians, but {limit}: raise it.")
+    if is_antialiased(path) and not training.antialiased:
+        say(f"{path} was trained with --pipeline.training.antialiased True: add that.")
+    if len(found.cloud):
+        _check_place(path, means, found)
     return count
+
+
+def _check_place(path: Path, means: Float64[Tensor, "n 3"], found: Inspected) -> None:
+    """See that most of these are as near to the points as Gaussians are that were trained from them."""
+    tree, middle = cKDTree(found.cloud), np.median(found.cloud, axis=0)
+    as_it_is, moved = (np.median(tree.query(places)[0]) for places in (means, found.to_run.points(means)))
+    if as_it_is < moved / 4:
+        raise UserError(f"{path} is in nerfstudio's frame, as ns-export writes it: use `abcd export`.")
+    if moved > np.median(np.linalg.norm(found.cloud - middle, axis=1)):
+        raise UserError(f"{path} lies elsewhere than the points: it is of another scene, or frame.")
 
 
 def where_data_is(data: Path | None, config: Path) -> Path | None:

@@ -236,11 +236,9 @@ class AbcdPipeline(VanillaPipeline):
         model, training, (points, colors) = self.model.config, self.config.training, self._cloud
         if model.init_splats is not None:
             read = self.datamanager.train_dataparser_outputs
-            to, found = (
-                Frame.of(read.dataparser_transform, read.dataparser_scale),
-                read_gaussians(model.init_splats),
-            )
-            say(f"Starting with {len(found):,} Gaussians of {model.init_splats}.")
+            found, lost = read_gaussians(model.init_splats)
+            note = f" {lost:,} others hold NaN, or no rotation." if lost else ""
+            say(f"Starting with {len(found):,} Gaussians of {model.init_splats}.{note}")
             to = Frame.of(read.dataparser_transform, read.dataparser_scale)
             return to.gaussians(found).of_degree(training.sh_degree)
         if len(points) and not model.random_init:

@@ -144,9 +144,13 @@ class AbcdTrainerConfig(TrainerConfig):
             start, model = find_start(self), self.pipeline.model
             check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
-            splats = 0 if start else splats_to_begin_with(model, self.pipeline.training.density.limit)
+            if start and start.step > self.max_num_iterations:
+                raise UserError(
+                    f"The run is at step {start.step:,} already: give --max-num-iterations above that."
+                )
             found = inspect(self.pipeline.datamanager.reader())
             say(found.in_words())
+            splats = 0 if start else splats_to_begin_with(model, self.pipeline.training, found)
             if self.pipeline.blocks == 0:
                 self._check_fit(found, splats)
 

@@ -1,5 +1,6 @@
 """A run that begins with the Gaussians of a .ply file: `--pipeline.model.init-splats`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +69,35 @@ def test_what_writers_put_down_is_read(tmp_path):
     written.means[2, 0], written.quats[3] = torch.nan, 0.0
     file = tmp_path / "scene.ply"
     write_ply(file, 5, 2, [written])
-    found = read_gaussians(file)
+    found, lost = read_gaussians(file)
+    assert lost == 2
     assert found.sh_degree == 2
     assert torch.equal(found.means, written.means[[0, 1, 4]])
     assert torch.equal(found.features_rest, written.features_rest[[0, 1, 4]])
     assert float(found.opacities[0].sigmoid()) == pytest.approx(1)
     assert float(found.scales[1, 2].exp()) == pytest.approx(0, abs=1e-8)
+
+
+def test_a_file_in_another_frame_is_refused(data, trained, tmp_path, capsys):
+    """nerfstudio's own is the one in which `ns-export` writes."""
+    _, file = trained
+    run_folder = file.parent / "wall" / "abcd" / "run"
+    moved, far = tmp_path / "moved.ply", tmp_path / "far.ply"
+    export(run_folder, out=moved, frame="nerfstudio")
+    found, _ = read_gaussians(file)
+    write_ply(far, len(found), found.sh_degree, [replace(found, means=found.means + 1000)])
+    for path, reason in ((moved, "is in nerfstudio's frame"), (far, "lies elsewhere")):
+        with pytest.raises(SystemExit):
+            run(start_from(path, data, tmp_path / "out"))
+        assert reason in capsys.readouterr().out
+
+
+def test_an_antialiased_file_asks_for_the_option(data, trained, tmp_path, capsys):
+    found, _ = read_gaussians(trained[1])
+    file = tmp_path / "scene.ply"
+    write_ply(file, len(found), found.sh_degree, [found], antialiased=True)
+    run(start_from(file, data, tmp_path / "out"))
+    assert "add that" in capsys.readouterr().out
 
 
 def points_alone(file: Path) -> None:
@@ -97,6 +121,8 @@ def cut_short(file: Path) -> None:
     ("write", "reason"),
     [
         (lambda _: None, "does not exist"),
+        (Path.mkdir, "is a folder"),
+        (lambda file: write_ply(file, 0, 0, []), "has no Gaussians"),
         (points_alone, "lacks scale_0"),
         (odd_harmonics, "has 2 harmonics f_rest"),
         (cut_short, "claims 9 points"),

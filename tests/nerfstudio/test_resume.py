@@ -290,6 +290,11 @@ def test_another_number_of_blocks_is_refused(data, stopped, tmp_path, capsys):
     assert "was begun with --pipeline.blocks 3, not 5" in said
 
 
+def test_fewer_steps_than_there_were_are_refused(data, stopped, tmp_path, capsys):
+    said = refusal(configure(data, tmp_path / "b", load_dir=stopped, steps=2), capsys)
+    assert "give --max-num-iterations above that" in said
+
+
 def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
     views, photos = ring_of_views(3), [Path(f"old/{i}.png") for i in range(3)]
     mine = MadeFor.of(photos, views, TrainingConfig())

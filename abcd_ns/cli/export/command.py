@@ -131,8 +131,9 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
 
 
 def _steps(blocks: Iterable[int], what: str) -> Iterator[int]:
-    blocks = list(blocks)
-    yield from track(blocks, what, console=Console(stderr=True), transient=True, disable=len(blocks) < 2)
+    blocks, console = list(blocks), Console(stderr=True)
+    quiet = len(blocks) < 2 or not console.is_terminal
+    yield from track(blocks, what, console=console, transient=True, disable=quiet)
 
 
 def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffix: str) -> None:

@@ -1,6 +1,7 @@
 """How a scene is trained: every option of the engine, with its default."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal
 
 from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
@@ -85,9 +86,10 @@ class TrainingConfig:
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
             ("batch", self.batch >= 0, "0 or more"),
+            ("density.max-gaussians", self.density.max_gaussians >= 0, "0 or more"),
         ):
             if not fits:
-                value = getattr(self, name.replace("-", "_"))
+                value = attrgetter(name.replace("-", "_"))(self)
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"
