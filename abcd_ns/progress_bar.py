@@ -1,12 +1,16 @@
 """A progress bar for work that may be over before anybody has looked."""
 
 import time
+from collections.abc import Collection, Iterable, Iterator
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
 
 APPEARS_AFTER = 2.0
 """Seconds of work after which the bar appears."""
+
+T = TypeVar("T")
 
 
 class ProgressBar:
@@ -19,7 +23,8 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, total: int, console: Console | None = None) -> None:
-        self._progress = Progress(console=console or Console(stderr=True), transient=True)
+        console = console or Console(stderr=True)
+        self._progress = Progress(console=console, transient=True, disable=not console.is_terminal)
         self._task = self._progress.add_task(title, total=total)
         self._start = time.monotonic()
         self._shown = False
@@ -37,3 +42,19 @@ class ProgressBar:
         if not self._shown and time.monotonic() - self._start > APPEARS_AFTER:
             self._progress.start()
             self._shown = True
+
+
+def tracked(
+    items: Iterable[T], title: str, total: int | None = None, console: Console | None = None
+) -> Iterator[T]:
+    """The items one by one, each of them some work, with a `ProgressBar`.
+
+    Args:
+        total: their number, where they are no collection.
+    """
+    if total is None and isinstance(items, Collection):
+        total = len(items)
+    with ProgressBar(title, total or 0, console) as bar:
+        for item in items:
+            yield item
+            bar.advance()

@@ -10,14 +10,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import has_alpha, open_picture, orientation, undecodable
 from abcd_ns.data.prepare import Prepared, check_masks
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
+from abcd_ns.progress_bar import tracked
 
 REDUCED = (64, 64)
 """JPEG photos are decoded at an eighth of their size, or a larger one of at least this many pixels."""
@@ -110,14 +109,13 @@ def survey(data: Path, downscale: int | None) -> Survey:
     check_masks(prepared.sources)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         looks = pool.map(look, prepared.sources)
-        bar = {"total": len(prepared.sources), "console": Console(stderr=True), "transient": True}
         return Survey(
             prepared=prepared,
             train=parser.rows("train"),
             held_out=parser.rows("test"),
             near=training_views(outputs.cameras, outputs.metadata.get("points3D_xyz"))[0].near,
             seen=visibility(prepared),
-            looks=tuple(track(looks, "Decoding photos", **bar)),
+            looks=tuple(tracked(looks, "Decoding photos", len(prepared.sources))),
             copies=copies(prepared.sources),
         )
 

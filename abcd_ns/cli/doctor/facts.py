@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from rich.console import Console
-from rich.progress import track
 
 from abcd_ns import __version__
 from abcd_ns.cli.train import find_tool
 from abcd_ns.errors import IMPORT_TROUBLE, first_line
 from abcd_ns.machine import describe_machine, output_of, own_commit, package_version
+from abcd_ns.progress_bar import tracked
 from abcd_ns.units import bytes_in_words
 
 PACKAGES = ("torch", "torchvision", "nerfstudio", "gsplat", "viser", "pycolmap", "numpy", "pillow")
@@ -87,8 +86,7 @@ class Facts:
 
 def gather() -> Facts:
     """Look at everything."""
-    bar = {"console": Console(stderr=True), "transient": True}
-    tried = {module: _start(module) for module in track(STARTED, "Looking at this machine", **bar)}
+    tried = {module: _start(module) for module in tracked(STARTED, "Looking at this machine")}
     broken = {module: error for module, error in tried.items() if error is not None}
     memory, place = psutil.virtual_memory(), Path("outputs") if Path("outputs").is_dir() else Path()
     number, plus, changes = (own_commit() or "").partition("+")

@@ -2,15 +2,13 @@
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import tyro
-from rich.console import Console
-from rich.progress import track
 
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.cli.paths import check_file, find_run
@@ -21,6 +19,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import Z_TO_Y
 from abcd_ns.formats.packed import BYTES_AT_ONCE
 from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
+from abcd_ns.progress_bar import tracked
 from abcd_ns.run import STATE, STORE
 
 TRANSFORMS = "dataparser_transforms.json"
@@ -66,7 +65,7 @@ def export(
     to = to_data(run) if frame == "data" else None
     with stored(run) as store:
         scene = Shown(store, to, box)
-        counts = {block: n for block in _steps(scene.blocks, "counting") if (n := scene.count(block))}
+        counts = {block: n for block in tracked(scene.blocks, "counting") if (n := scene.count(block))}
         if not counts:
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
         if suffix in PACKED:
@@ -111,7 +110,7 @@ def stored(run: Path) -> Iterator[ParameterStore]:
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
     # Turned so that y is up; in the run's own frame z is.
     up = Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
-    parts = (scene.gaussians(block) for block in _steps(counts, "writing"))
+    parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
     with replacing(out) as partial:
         write_scene(partial, suffix, sum(counts.values()), scene.sh_degree, up, parts, scene.antialiased)
         rounding(suffix, scene.largest)
@@ -122,18 +121,12 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
     out.mkdir()
     written = []
     try:
-        for block in _steps(counts, "writing"):
+        for block in tracked(counts, "writing"):
             written += _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
     except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
         raise
     return written
-
-
-def _steps(blocks: Iterable[int], what: str) -> Iterator[int]:
-    blocks, console = list(blocks), Console(stderr=True)
-    quiet = len(blocks) < 2 or not console.is_terminal
-    yield from track(blocks, what, console=console, transient=True, disable=quiet)
 
 
 def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffix: str) -> None:

@@ -8,7 +8,6 @@ import matplotlib
 import numpy as np
 from PIL import Image
 from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
 from abcd_ns.engine.train.schedule import evenly
@@ -16,6 +15,7 @@ from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray,
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.progress_bar import tracked
 from abcd_ns.viewer.images import data_uri
 
 PAGE_PIXELS = 6_000_000
@@ -60,19 +60,19 @@ class HeldOut:
 
 def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) -> HeldOut:
     """Draw and score every held-out view; keep pictures of `pictures` of them: best, worst and between."""
-    scores, gaps, bar = [], [], {"console": console, "transient": True}
+    scores, gaps = [], []
     count = len(pipeline.datamanager.eval_dataset)
-    for drawn in track(draw_held_out(pipeline), "Held-out views", total=count, **bar):
+    for drawn in tracked(draw_held_out(pipeline), "Held-out views", count, console):
         scores.append(drawn.score)
         gaps.append(drawn.squared_gap)
     gap, note = ordering_gap(gaps, pipeline.model.tree.num_blocks) if scores else (None, "no held-out view")
     places, shown = pick(scores, pictures), {}
-    for drawn in track(draw_held_out(pipeline, places), "Pictures", total=len(places), **bar):
+    for drawn in tracked(draw_held_out(pipeline, places), "Pictures", len(places), console):
         row = drawn.row
         shown[row] = _show(drawn, scores[row], places[row], len(places))
     said = note if gap is None else f"{gap:.1f} dB"
     views = evenly([view for view in pipeline.training_views() if view.nearest], FOG_VIEWS)
-    fog = tuple(pipeline.model.fog(view) for view in track(views, "Fog", **bar))
+    fog = tuple(pipeline.model.fog(view) for view in tracked(views, "Fog", console=console))
     return HeldOut(tuple(scores), said, tuple(shown[row] for row in places), fog)
 
 
