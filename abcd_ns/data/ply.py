@@ -55,11 +55,11 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def some_means(path: Path, most: int) -> tuple[int, Float64[Tensor, "n 3"]]:
-    """How many Gaussians a .ply file has, and the means of up to so many, evenly spaced; raises as
+    """How many Gaussians a .ply file has, and the means of up to so many, evenly spaced and finite; raises as
     `read_gaussians`."""
     rows, groups = _rows(path)
-    some = rows[:: -(-len(rows) // most)]
-    return len(rows), _columns(some, groups["means"]).double()
+    some = _columns(rows[:: -(-len(rows) // most)], groups["means"]).double()
+    return len(rows), some[some.isfinite().all(dim=1)]
 
 
 def is_antialiased(path: Path) -> bool:

@@ -91,18 +91,20 @@ def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found
         raise UserError(f"{path} has {count:,} Gaussians, but {limit}: raise it.")
     if is_antialiased(path) and not training.antialiased:
         say(f"{path} was trained with --pipeline.training.antialiased True: add that.")
-    if len(found.cloud):
-        _check_place(path, means, found)
+    _check_place(path, means, found)
     return count
 
 
 def _check_place(path: Path, means: Float64[Tensor, "n 3"], found: Inspected) -> None:
     """See that most of these are as near to the points as Gaussians are that were trained from them."""
-    tree, middle = cKDTree(found.cloud), np.median(found.cloud, axis=0)
+    cloud = found.cloud[np.isfinite(found.cloud).all(axis=1)]
+    if not len(cloud) or not len(means):
+        return
+    tree, middle = cKDTree(cloud), np.median(cloud, axis=0)
     as_it_is, moved = (np.median(tree.query(places)[0]) for places in (means, found.to_run.points(means)))
     if as_it_is < moved / 4:
         raise UserError(f"{path} is in nerfstudio's frame, as ns-export writes it: use `abcd export`.")
-    if moved > np.median(np.linalg.norm(found.cloud - middle, axis=1)):
+    if moved > np.median(np.linalg.norm(cloud - middle, axis=1)):
         raise UserError(f"{path} lies elsewhere than the points: it is of another scene, or frame.")
 
 
