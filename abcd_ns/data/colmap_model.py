@@ -90,10 +90,8 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
             pose = _camera_to_world(quat, translation, label)
             frames.append(Frame(called[name], pose, lenses[camera], hidden and _mask(hidden, called[name])))
     if hidden and frames and not any(frame.mask_path for frame in frames):
-        lacks = (
-            "has no mask such as" if hidden.folder.is_dir() else "does not exist: it would have masks such as"
-        )
-        problems.append(f"{hidden.folder} {lacks} {frames[0].name}.png; put masks there.")
+        lacks = "has no mask" if hidden.folder.is_dir() else "does not exist, nor a mask"
+        problems.append(f"{hidden.folder} {lacks} such as {frames[0].name}.png; put masks there.")
     problems.raise_if_any()
     frames.sort(key=lambda frame: frame.name)
     return Scene(

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 
 _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
@@ -28,7 +29,6 @@ _COLORS = tuple(
 """What programs call colours, in lower case."""
 _HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 """What files of Gaussians have in their place: colour = 0.5 + Y00 x coefficient (Kerbl et al., 2023)."""
-_Y00 = 0.28209479177387814
 _MOST = 20.0
 """Of an opacity's logit, and of minus a scale's logarithm, which files may hold as infinite."""
 _RESTS = (0, 9, 24, 45)
@@ -185,6 +185,6 @@ def _colors(points: np.ndarray) -> np.ndarray | None:
         rgb = np.where(np.isfinite(rgb), rgb, 0)
         whites, slack = (1, *_WHITES), _OVERSHOOT
     if names == _HARMONICS:
-        rgb, whites = 0.5 + _Y00 * rgb, (1,)
+        rgb, whites = 0.5 + SH_C0 * rgb, (1,)
     white = next((white for white in whites if rgb.max(initial=0) <= slack * white), whites[-1])
     return np.clip(np.round(rgb * (255 / white)), 0, 255).astype(np.uint8)

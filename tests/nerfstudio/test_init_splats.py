@@ -52,6 +52,14 @@ def test_a_run_begins_where_the_file_ended(data, trained, tmp_path):
         assert torch.allclose(found[name], expected[name], atol=2e-5), name
 
 
+def test_its_blocks_are_trained_as_trained_ones_are(data, trained, tmp_path):
+    """By steps of four views from the first on; those of a block that begins with points draw one."""
+    drawn = []
+    config = start_from(trained[1], data, tmp_path, steps=6)
+    run(config, after_step=lambda trainer: drawn.append(trainer.pipeline.coordinator.batch))
+    assert set(drawn) == {4}
+
+
 def test_it_learns_grows_and_resumes(data, trained, tmp_path):
     _, file = trained
     first = run(start_from(file, data, tmp_path, steps=40), stop_after=25)
