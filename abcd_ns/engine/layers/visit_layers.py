@@ -30,6 +30,8 @@ class VisitLayers:
         window_weight: see Recipe.
         views: all views, by index.
         parts_bytes: size of the layers held while nodes are folded, beside what is free in the store.
+        backwards: load nodes in the opposite order. Where visits alternate, what the one before read last is
+            still in RAM.
     """
 
     def __init__(
@@ -43,12 +45,13 @@ class VisitLayers:
         *,
         window_weight: float,
         parts_bytes: int,
+        backwards: bool = False,
     ) -> None:
         self._renderer, self._store = renderer, store
         # A copy: whatever becomes of the views, these are drawn.
         self._geometry, self._views, self._settings = geometry, dict(views), settings
         self._window_weight, self._parts_bytes = window_weight, parts_bytes
-        self._nodes = renderer.nodes(exclude=geometry.block)
+        self._nodes = renderer.nodes(exclude=geometry.block)[:: -1 if backwards else 1]
         self._own = own if renderer.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
         seen = [(views[view], crop) for view, crop in sorted(geometry.crops.items())]
@@ -79,7 +82,8 @@ class VisitLayers:
             together = list(map(add, held, own))
             if group and max(together) * BYTES_PER_PIXEL > self._parts_bytes + self._store.free:
                 yield group
-                group, together = [], own
+                self._nodes = self._nodes[::-1]
+                group, together = [], list(self._held(view))
             group.append(view)
             held = together
         if group:

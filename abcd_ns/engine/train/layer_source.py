@@ -49,6 +49,7 @@ def layers_of_visit(
         RenderSettings(active.sh_degree, config.antialiased),
         window_weight=config.recipe.window_weight,
         parts_bytes=parts_bytes(run, run.views.values(), blocks=2),
+        backwards=active.number % 2 == 1,
     )
     wanted = tuple(dict.fromkeys(views))
     for done, _ in enumerate(layers.draw(wanted), start=1):

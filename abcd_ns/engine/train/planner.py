@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from statistics import median_high
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -74,6 +75,11 @@ class Visits(Protocol):
     ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
         """What the loss compares, pictures and photos as far as they say something about the block: all."""
         return pictures, photos
+
+
+def typical(views: Mapping[int, int]) -> int:
+    """Of the blocks that views see, by how many the median one is seen."""
+    return median_high(filter(None, views.values()))
 
 
 def views_of_step(config: TrainingConfig, blocks: int, trained: int) -> int:
@@ -220,7 +226,7 @@ class Planner(Visits):
         remaining = None if self._budget.steps is None else self._budget.steps - state.planned
         used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
         blocks = self._scene.tree.num_blocks
-        passes = passes_of_visit(config.recipe.passes, max(used.values()), at_once, blocks)
+        passes = passes_of_visit(config.recipe.passes, typical(used), at_once, blocks)
         if state.epoch % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
@@ -264,8 +270,8 @@ class Planner(Visits):
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
-        most = max(state.views.values())
-        return views_per_visit(seen, most, self._config.recipe.visit_views) if most else 0
+        limit = self._config.recipe.visit_views
+        return views_per_visit(seen, typical(state.views), limit) if seen else 0
 
     def _may_see(self, block: int) -> dict[int, View]:
         """The views whose frusta meet the block's bounds, by index."""

@@ -29,7 +29,8 @@ class Recipe:
     the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
     share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
     visit_views: int = 64
-    """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
+    """Views that a visit uses of a block that as many views see as the median block. Others use the same
+    share of theirs, and twice as many at most."""
     passes: int = 8
     """Uses of each of these views in a visit, where they are 32 or fewer; in proportion fewer uses where they
     are more."""

@@ -133,14 +133,15 @@ def evenly(values: Sequence[T], wanted: int) -> list[T]:
     return [values[int((k + 0.5) * len(values) / wanted)] for k in range(wanted)]
 
 
-def views_per_visit(seen: int, most_seen: int, limit: int) -> int:
+def views_per_visit(seen: int, typical: int, limit: int) -> int:
     """How many of the `seen` views of a block a visit uses.
 
-    The same share of every block's views, so that what steps draw stays in proportion, and `limit` for the
-    block that `most_seen` views see: a visit draws F and B for each view it uses, and stays short where there
-    are many.
+    The same share of every block's views, so that what steps draw stays in proportion, and `limit` for a
+    block that as many views see as the median block, `typical`. A visit draws F and B for each view it uses:
+    it uses twice the limit at most.
     """
-    return -(-seen * min(limit, most_seen) // most_seen)  # rounded up
+    share = -(-seen * min(limit, typical) // typical)  # rounded up
+    return min(seen, share, 2 * limit)
 
 
 def visit_views(views: tuple[int, ...], count: int, visits: int, seed: int) -> tuple[int, ...]:

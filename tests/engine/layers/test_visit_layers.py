@@ -1,5 +1,7 @@
 """The layers of a visit: what is read for them, and that no room for them changes them."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -23,7 +25,9 @@ class Watched(MemoryScene):
         return super().drawn(block, device, which)
 
 
-def visit_layers(parts_bytes: int, device_bytes: int) -> tuple[VisitLayers, list[int]]:
+def visit_layers(
+    parts_bytes: int, device_bytes: int, backwards: bool = False
+) -> tuple[VisitLayers, list[int]]:
     """Of a visit to one of 16 blocks, and the blocks that it has read so far."""
     gaussians, draw, views = random_gaussians(200, size=0.03), TorchRasterizer(), ring_of_views(6)
     scene = Watched(build_kd(gaussians.means, 16), gaussians)
@@ -39,6 +43,7 @@ def visit_layers(parts_bytes: int, device_bytes: int) -> tuple[VisitLayers, list
         RenderSettings(sh_degree=1),
         window_weight=0.05,
         parts_bytes=parts_bytes,
+        backwards=backwards,
     )
     return layers, scene.read
 
@@ -51,12 +56,23 @@ def test_where_views_have_room_blocks_are_read_twice_at_most_for_all_of_them():
     assert max(read.count(block) for block in range(16)) <= 2
 
 
+@pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("parts_bytes", [0, 100_000])
-def test_layers_are_the_same_whatever_room_there_is(parts_bytes):
+def test_layers_are_the_same_whatever_room_there_is_and_wherever_reading_begins(parts_bytes, backwards):
     expected = list(visit_layers(1 << 30, 1 << 30)[0].draw(range(6)))
-    layers, read = visit_layers(parts_bytes, device_bytes=0)
+    layers, read = visit_layers(parts_bytes, device_bytes=0, backwards=backwards)
     for kept, other in zip(layers.draw(range(6)), expected, strict=True):
         assert torch.equal(kept.layers, other.layers)
         planes = [one.interleaved.planes if one.interleaved else torch.zeros(0) for one in (kept, other)]
         assert torch.equal(*planes)
     assert max(read.count(block) for block in range(16)) > 2
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_what_one_group_of_views_read_last_the_next_one_reads_first(backwards):
+    layers, read = visit_layers(0, device_bytes=0, backwards=backwards)
+    ends = []
+    for _ in layers.draw(range(6)):
+        ends.append((read[:3], read[-3:]))
+        read.clear()
+    assert all(set(last) & set(first) for (_, last), (first, _) in itertools.pairwise(ends))
