@@ -17,9 +17,9 @@ class Controls:
     """A folder of controls; texts are sent only when they change.
 
     Args:
-        order: where in the sidebar; viser sorts by it.
-        changed: called, in a thread of viser's, when the user has chosen something.
-        trains: whether a run is under way, and not a finished scene looked at.
+        order: place in the sidebar.
+        changed: called in a thread of viser's when the user has chosen something.
+        trains: whether a run is under way; else a finished scene is shown.
     """
 
     def __init__(self, gui: viser.GuiApi, order: float, changed: Callable[[], None], trains: bool) -> None:
@@ -59,7 +59,7 @@ class Controls:
         return None if self._block.value == FOLLOW else int(self._block.value) - 1
 
     def set_blocks(self, count: int) -> None:
-        """Offer so many blocks for choice."""
+        """Offer that many blocks for choice."""
         names = tuple(str(block + 1) for block in range(count))
         self._block.options = (FOLLOW, *names) if self._trains else names
 
@@ -71,6 +71,6 @@ class Controls:
 
     def progress(self, share: float) -> None:
         """Move the bar; 0..1."""
-        value = round(100 * min(max(share, 0.0), 1.0), 1)
+        value = round(100 * min(share, 1.0), 1)
         if self._run.value != value:
             self._run.value = value

@@ -1,7 +1,6 @@
 """Small images in the panel, as Markdown: a curve, and a photo.
 
-viser can show plotly's figures, but sends every browser 5 MiB of script for it, and its version 0.2 may draw
-them wider than the panel.
+viser's own plots send every browser 5 MiB of script.
 """
 
 import base64
@@ -20,11 +19,7 @@ LINE, GRID, TEXT = "#ffd369", "#3a3f4b", "#c1c2c5"
 
 
 def curve_image(points: Sequence[tuple[float, float]], name: str) -> str:
-    """The curve through (x, y) points; a sentence if there are fewer than two.
-
-    Args:
-        name: what it shows, for readers that do not see it.
-    """
+    """The curve through (x, y) points, with an alternative text; a sentence for fewer than two points."""
     if len(points) < 2:
         return "Nothing to show yet."
     import matplotlib  # runs do without it

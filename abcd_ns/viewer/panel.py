@@ -11,12 +11,11 @@ import torch
 import viser
 import viser.transforms as vtf
 from jaxtyping import UInt8
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
+from abcd_ns.data.input_errors import say
 from abcd_ns.engine import events
-from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkerSeen, WorkersSeen
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
@@ -27,10 +26,10 @@ from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
 from abcd_ns.viewer.scenery import Scenery, boxes_of, bulk, first_look, nearest_view, views_that_see
 from abcd_ns.viewer.status import BlockRow, Status, status_of, time_left
-from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, worker_line
+from abcd_ns.viewer.texts import block_table, clock, memory_table, reach, worker_line
 
 AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
-"""Events that the browser is told of at once, of others once in SECONDS_BETWEEN_UPDATES."""
+"""Events that are shown at once; others once in SECONDS_BETWEEN_UPDATES."""
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 10.0
 HANDOVER_SECONDS = 0.002
@@ -45,9 +44,9 @@ class AbcdPanel(ViewerControl):
     training lock: events come from the training thread, which holds it, and the user's choices take it.
 
     Args:
-        model: an AbcdModel: its `tree`, `choice` and `scene()` are read.
-        views: gives the training views when asked.
-        photo: gives the photo of one by its index.
+        model: an AbcdModel.
+        views: returns the training views.
+        photo: returns the photo of a view by its index.
     """
 
     def __init__(
@@ -65,10 +64,10 @@ class AbcdPanel(ViewerControl):
         self._photo_of: int | None = None
         self._stage = ""
         """What is done between steps."""
-        self._workers: tuple[WorkerSeen, ...] = ()
+        self._workers: tuple[events.WorkerSeen, ...] = ()
         self._over = False
         self._laid_out = 0
-        """Blocks for which boxes and lists are made; 0 before that."""
+        """Blocks that have boxes and entries in the list."""
         self._bounds: Box | None = None
         self._training_views: list[View] = []
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
@@ -80,7 +79,7 @@ class AbcdPanel(ViewerControl):
         if (rules := rules_of(server)) is not None:
             rules.share = share
         if not share and (line := reach(viewer.config.websocket_host)) is not None:
-            CONSOLE.print(line, highlight=False)
+            say(line)
         # nerfstudio's title bar fetches a picture from its site; viser's offers everyone a public tunnel.
         look = {"control_layout": "collapsible", "dark_mode": True, "brand_color": (255, 211, 105)}
         server.gui.configure_theme(**look, show_share_button=share)
@@ -93,30 +92,27 @@ class AbcdPanel(ViewerControl):
             self._update()
 
     def follow(self, coordinator: Trainer, log: Any) -> None:
-        """From now on show how this run goes.
-
-        Args:
-            log: a RunLog: its `visits` and `curve` are read.
-        """
+        """Show how a run goes, and the `visits` and `curve` of its RunLog."""
         self._coordinator, self._log = coordinator, log
         if self._controls is not None:
             self._lay_out()
             coordinator.announce.subscribe(self)
             self._update()
 
-    def __call__(self, event: Event) -> None:
+    def __call__(self, event: events.Event) -> None:
         """Take an event in."""
-        self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
-        names = {LayersDrawn: "layers", Pruning: "final pruning"}
+        if isinstance(event, events.WorkersSeen):
+            self._workers = event.workers
+        names = {events.LayersDrawn: "layers", events.Pruning: "final pruning"}
         self._stage = f"{names[type(event)]} {event.done} of {event.total}" if type(event) in names else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
         if due or isinstance(event, AT_ONCE):
             self._update()
-        if isinstance(event, WorkersSeen) or (due and self._stage):
+        if isinstance(event, events.WorkersSeen) or (due and self._stage):
             self._let_viewer_draw()
 
     def _let_viewer_draw(self) -> None:
-        """Hand the training lock over for one picture: layers and workers take long, and browsers wait."""
+        """Release the training lock for one picture: layers and workers take long, and browsers wait."""
         lock = self.viewer.train_lock
         if lock is None or not lock.locked() or not self.viewer.render_statemachines:
             return
@@ -129,7 +125,7 @@ class AbcdPanel(ViewerControl):
     # -- what is shown
 
     def _lay_out(self) -> None:
-        """Boxes and the list of blocks, once the cut of space is known, and when blocks were cut in two."""
+        """Make boxes and the list of blocks anew, as the tree is cut now."""
         tree, scene = self._model.tree, self._model.scene()
         if self._bounds is None:  # once: every block is read for it, and one may be on the device
             means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]
@@ -143,7 +139,7 @@ class AbcdPanel(ViewerControl):
     def _update(self) -> None:
         if not self._laid_out:
             return
-        if self._laid_out != self._model.tree.num_blocks:  # a block was cut in two
+        if self._laid_out != self._model.tree.num_blocks:  # a block was split
             self._lay_out()
         self._updated = time.monotonic()
         rows = self._rows()
@@ -154,14 +150,14 @@ class AbcdPanel(ViewerControl):
             self._report(self._coordinator)
 
     def _report(self, coordinator: Trainer) -> None:
-        state = coordinator.state
-        said = headline(self._where(state), coordinator.progress, time_left(coordinator))
+        state, left = coordinator.state, clock(time_left(coordinator))
+        headline = f"**{self._where(state)}**  \n{coordinator.progress:.0%} of the run, {left} left"
         epoch = f"Epoch {state.epoch}: {len(state.queue)} visits are waiting" if state.queue else ""
-        over = coordinator.finished and not self._stage
-        if over and not self._over:
-            self._over, self._controls.boxes.value = True, False  # they were about the training
-        said = "**Trained.**" if over else said
-        self._controls.write(headline=said, epoch=epoch)
+        if coordinator.finished and not self._stage:
+            headline = "**Trained.**"
+            if not self._over:
+                self._over, self._controls.boxes.value = True, False  # they were about the training
+        self._controls.write(headline=headline, epoch=epoch)
         self._controls.progress(coordinator.progress)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
@@ -186,9 +182,9 @@ class AbcdPanel(ViewerControl):
         scene, blocks = self._model.scene(), range(self._model.tree.num_blocks)
         if self._coordinator is None:
             state = (Status.UNTRAINED, Status.DONE)
-            return [BlockRow(b, state[scene.count(b) > 0], scene.count(b), None, None) for b in blocks]
+            return [BlockRow(b, state[scene.count(b) > 0], scene.count(b)) for b in blocks]
         if self._coordinator.config.recipe.exact:
-            return [BlockRow(b, Status.ACTIVE, None, None, None) for b in blocks]
+            return [BlockRow(b, Status.ACTIVE) for b in blocks]
         state, active = self._coordinator.state, self._active()
         psnrs = {visit.block: visit.psnr for visit in self._log.visits}
         counts = [None if state.active and state.active.is_whole else scene.count(b) for b in blocks]
@@ -215,7 +211,7 @@ class AbcdPanel(ViewerControl):
         return rows
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Let a browser begin where the scene is to be seen."""
+        """Place a new browser's camera so that it sees the scene."""
         if self._first_look is not None:
             client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
@@ -232,7 +228,7 @@ class AbcdPanel(ViewerControl):
         self.viewer._trigger_rerender()
 
     def _show_photo(self, client: viser.ClientHandle) -> None:
-        """The photo of the training view nearest to where a browser looks from, if that is wanted."""
+        """Show the photo of the training view nearest to a browser's camera, if that is wanted."""
         view = None
         if self._controls.photo.value:
             forward = vtf.SO3(client.camera.wxyz).as_matrix()[:, 2]
@@ -256,7 +252,7 @@ class AbcdPanel(ViewerControl):
         self._cameras_of = block
 
     def _views_of(self, block: int) -> list[View]:
-        """The views that the block is trained on, or, as far as that is unknown, those that see it."""
+        """The views that the block is trained on; those that see it where that is unknown."""
         if self._coordinator is not None and block in self._coordinator.state.influence:
             known = self._coordinator.state.influence[block]
             kept = worth_training(known, self._coordinator.config.recipe.influence_share)

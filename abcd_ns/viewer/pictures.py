@@ -4,12 +4,10 @@ import atexit
 import math
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import over
@@ -18,16 +16,14 @@ from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.cpu.reference import MIN_TRANSMITTANCE
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
-from abcd_ns.engine.types import Gaussians, Layer, View
+from abcd_ns.engine.types import Gaussians, View
 
 MOST_PIXELS = 2048 * 2048
 """Of a picture for the viewer, whatever size a client asks for; nerfstudio's slider ends there."""
 FAR = 1e4
 """Depth of pictures that have none; world units."""
 SECONDS_TO_END = 10.0
-"""That pictures which are being drawn have when the process ends."""
-SECONDS_OF_SILENCE = 1.0
-"""After which it is said what is waited for."""
+"""For pictures that are being drawn when the process ends."""
 
 
 class Show(str, Enum):
@@ -56,27 +52,17 @@ def asked_by_viewer() -> bool:
 
 @atexit.register
 def end_drawing() -> None:
-    """Have no thread draw for a browser when Python ends: it would be stopped in the midst of torch's C++,
-    which aborts the process."""
+    """Wait for threads that draw for browsers: stopped in torch's C++ they would abort the process."""
     drawing = [thread for thread in threading.enumerate() if isinstance(thread, RenderStateMachine)]
     for thread in drawing:
         thread.running, thread.interrupt_render_flag = False, True
-    _join(drawing, SECONDS_OF_SILENCE)
-    if any(thread.is_alive() for thread in drawing):
-        left = SECONDS_TO_END - SECONDS_OF_SILENCE
-        CONSOLE.print(f"Waiting for the viewer's last picture, {left:.0f} s at most.", highlight=False)
-        _join(drawing, left)
-
-
-def _join(threads: Sequence[threading.Thread], seconds: float) -> None:
-    """Wait for all of them to end, so long at most."""
-    until = time.monotonic() + seconds
-    for thread in threads:
+    until = time.monotonic() + SECONDS_TO_END
+    for thread in drawing:
         thread.join(max(until - time.monotonic(), 0.0))
 
 
 def chosen_outputs() -> tuple[str, ...]:
-    """Which outputs of the model the browser is to be shown, where one has asked."""
+    """Outputs of the model that the browser of this thread shows; none in other threads."""
     if not asked_by_viewer():
         return ()
     panel = threading.current_thread().viewer.control_panel
@@ -111,12 +97,16 @@ class BlockPictures:
         own = self.renderer.scene.drawn(block, self.renderer.device)
         if show is Show.BLOCK:
             return self._raster(own)
-        window = self._window(own)
+        window = None
+        if self.renderer.ownership == "fragments":
+            options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
+            window = self.renderer.rasterizer.depth_window(own, self.view, crop=self.view.full, **options)
         around = self._around(block, window)
+        layer = around.front if show is Show.FRONT else around.back
         if show is Show.COMPOSITE:
             active = self._raster(own, around.inside, window if around.inside is not None else None)
-            return _far_away(over(around.front, over(active.layer, around.back)))
-        return _far_away(around.front if show is Show.FRONT else around.back)
+            layer = over(around.front, over(active.layer, around.back))
+        return Raster(layer.color, layer.transmittance, FAR * (1 - layer.transmittance), {})
 
     def _raster(
         self, gaussians: Gaussians, frozen: Splats | None = None, window: ZWindow | None = None
@@ -126,12 +116,6 @@ class BlockPictures:
         shot = Shot(self.view, self.view.full, frozen, window)
         return self.renderer.rasterizer.draw(gaussians, [shot], **vars(self.settings))[0]
 
-    def _window(self, own: Gaussians) -> ZWindow | None:
-        if self.renderer.ownership == "means":
-            return None
-        options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
-        return self.renderer.rasterizer.depth_window(own, self.view, crop=self.view.full, **options)
-
     def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
         renderer, view = self.renderer, self.view
         seen, parts = Seen(view, view.full, window), dict[int, FrozenLayers | None]()
@@ -140,7 +124,3 @@ class BlockPictures:
             (parts[node],) = renderer.render(node, renderer.load(shown), [seen], self.settings, block)
             renderer.fold_up(parts, node, seen)
         return renderer.fold(parts, view, view.full)
-
-
-def _far_away(layer: Layer) -> Raster:
-    return Raster(layer.color, layer.transmittance, FAR * (1 - layer.transmittance), {})

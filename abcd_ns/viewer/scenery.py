@@ -50,7 +50,7 @@ SEEN_SHARE = 0.05
 
 
 class Scenery:
-    """Keeps boxes and frusta in a viser scene as they should be, sending only what changed."""
+    """Boxes and frusta in a viser scene; sends only what changed."""
 
     def __init__(self, scene: viser.SceneApi, frustum_scale: float) -> None:
         self._scene, self._frustum_scale = scene, frustum_scale
@@ -60,7 +60,7 @@ class Scenery:
         self._frusta: list[viser.SceneNodeHandle] = []
 
     def set_boxes(self, boxes: Mapping[int, Box]) -> None:
-        """The boxes to show, by block; drawn when their states are known."""
+        """Replace the boxes, by block; `show_boxes` draws them."""
         self._boxes, self._drawn = dict(boxes), {}
 
     def show_boxes(self, status: Mapping[int, Status], visible: bool) -> None:
@@ -71,7 +71,6 @@ class Scenery:
                 self._draw_box(block + 1, box, status[block], visible)
 
     def _draw_box(self, number: int, box: Box, status: Status, visible: bool) -> None:
-        """Draw it in place of what has its name."""
         active, edges = status is Status.ACTIVE, edges_of(box)
         look = {"color": COLORS[status], "line_width": ACTIVE_WIDTH if active else WIDTH, "visible": visible}
         straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": len(edges) - 1}
@@ -82,7 +81,7 @@ class Scenery:
             self._scene.add_label(f"/abcd/label_{number}", text, position=position, visible=visible)
 
     def show_cameras(self, views: Sequence[View]) -> None:
-        """Frusta of these cameras and no others."""
+        """Show frusta of these cameras and no others."""
         for node in self._frusta:
             node.remove()
         chosen = views[:: -(-len(views) // MOST_FRUSTA)] if views else []
@@ -102,18 +101,18 @@ class Scenery:
 
 
 def bulk(means: Float[Tensor, "n 3"]) -> Box:
-    """The box that holds nearly all points; outliers do not stretch it. A unit cube if there are none."""
+    """The box that holds the bulk of the points; a unit cube if there are none."""
     points = means[torch.isfinite(means).all(dim=1)].double().cpu()
     points = points[:: max(len(points) // MOST_POINTS, 1)]
     if len(points) == 0:
-        return Box(torch.full((3,), -0.5).double(), torch.full((3,), 0.5).double())
+        return Box(torch.zeros(3).double() - 0.5, torch.zeros(3).double() + 0.5)
     low, high = torch.quantile(points, torch.tensor([(1 - BULK) / 2, (1 + BULK) / 2]).double(), dim=0)
     margin = (MARGIN * (high - low)).clamp_min(1e-3)
     return Box(low - margin, high + margin)
 
 
 def boxes_of(tree: BlockTree, bounds: Box) -> dict[int, Box]:
-    """By block, its box within the bounds, a little apart from others; blocks outside are missing."""
+    """Boxes by block, cut to the bounds and a little apart; blocks outside are left out."""
     gap, found = GAP * float((bounds.upper - bounds.lower).norm()), {}
     for block in range(tree.num_blocks):
         cell = tree.cell(block)
@@ -133,12 +132,8 @@ def edges_of(box: Box) -> tuple[tuple[float, float, float], ...]:
 def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Where a browser looks from at first, and at what, in the viewer's units.
 
-    Above the camera that is farthest from the middle, whose frustum would be in the way from its own place.
-    From outside, what lies behind the scene would hide it.
-
-    Args:
-        box: holds the bulk of the scene.
-        views: the training views; without any, the scene is looked at from one corner of the box.
+    That is above the training camera farthest from the middle of the box, or from a corner without cameras:
+    from outside, what lies behind the scene would hide it.
     """
     target = (box.lower + box.upper) / 2
     centers = list(centers_of(views)) if views else [box.upper]
@@ -150,7 +145,7 @@ def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"],
 def nearest_view(
     eye: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"], views: Sequence[View]
 ) -> View | None:
-    """The view that is taken nearest to `eye`, in the viewer's units, and most nearly along `forward`."""
+    """The view nearest to `eye` (viewer's units) and most nearly along `forward`; None without views."""
     if not views:
         return None
     centers = centers_of(views)

@@ -29,16 +29,16 @@ class BlockRow:
 
     block: int
     status: Status
-    gaussians: int | None
+    gaussians: int | None = None
     """None while a coarse model of all blocks is trained."""
-    psnr: float | None
+    psnr: float | None = None
     """Of the training crops in the later half of its last visit, dB."""
-    views: int | None
+    views: int | None = None
     """Worth training it on; None while that is unknown."""
 
 
 def status_of(block: int, state: RunState, active: Collection[int]) -> Status:
-    """Of one block, while these blocks are in training."""
+    """The status of a block while `active` ones are in training."""
     if state.active is not None and state.active.is_whole:
         return Status.WARM_UP
     if block in active:

@@ -13,7 +13,6 @@ from abcd_ns.viewer.status import BlockRow, Status
 
 MOST_ROWS = 24
 """Of the table of blocks; with more blocks those that are active or under-observed come first."""
-
 CONTAINER_MARKS = (Path("/.dockerenv"), Path("/run/.containerenv"))
 """What docker and podman leave in their containers."""
 
@@ -34,11 +33,6 @@ def clock(seconds: float | None) -> str:
     return "unknown" if seconds is None else str(timedelta(seconds=int(seconds)))
 
 
-def headline(where: str, progress: float, left: float | None) -> str:
-    """What is being done, and how long the run takes yet."""
-    return f"**{where}**  \n{progress:.0%} of the run, {clock(left)} left"
-
-
 def worker_line(worker: WorkerSeen) -> str:
     """What a worker is doing; workers count from 1."""
     what = "waits" if worker.visits else "is starting"
@@ -57,7 +51,13 @@ def block_table(rows: Sequence[BlockRow]) -> str:
     trained = any(row.psnr is not None or row.views is not None for row in rows)
     lines = ["| # | state | Gaussians |" + " PSNR | views |" * trained]
     lines += ["| ---: | --- | ---: |" + " ---: | ---: |" * trained]
-    lines += [_row(row, trained) for row in shown]
+    for row in shown:
+        status = f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value
+        cells = [str(row.block + 1), status, "-" if row.gaussians is None else f"{row.gaussians:,}"]
+        if trained:
+            cells.append("-" if row.psnr is None else f"{row.psnr:.2f}")
+            cells.append("-" if row.views is None else str(row.views))
+        lines.append(f"| {' | '.join(cells)} |")
     if len(rows) > len(shown):
         counts = Counter(row.status.value for row in rows)
         said = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
@@ -65,24 +65,8 @@ def block_table(rows: Sequence[BlockRow]) -> str:
     return "\n".join(lines)
 
 
-def _row(row: BlockRow, trained: bool) -> str:
-    cells = [
-        str(row.block + 1),
-        f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value,
-        "-" if row.gaussians is None else f"{row.gaussians:,}",
-    ]
-    if trained:
-        cells += ["-" if row.psnr is None else f"{row.psnr:.2f}"]
-        cells += ["-" if row.views is None else str(row.views)]
-    return f"| {' | '.join(cells)} |"
-
-
 def memory_table(rows: Sequence[tuple[str, int, int]]) -> str:
-    """What is held, against what it may grow to.
-
-    Args:
-        rows: (what, bytes, limit in bytes).
-    """
+    """What is held, against its limit: rows of (what, bytes, limit in bytes)."""
     lines = ["| memory | used | of |", "| --- | ---: | ---: |"]
     lines += [f"| {what} | {bytes_in_words(used)} | {bytes_in_words(limit)} |" for what, used, limit in rows]
     return "\n".join(lines)

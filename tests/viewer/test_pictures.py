@@ -2,27 +2,17 @@
 
 import subprocess
 import sys
-import threading
-import time
 from dataclasses import replace
 
 import pytest
 import torch
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import over
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.viewer.pictures import (
-    FAR,
-    MOST_PIXELS,
-    BlockPictures,
-    Show,
-    bounded,
-    end_drawing,
-)
+from abcd_ns.viewer.pictures import FAR, MOST_PIXELS, BlockPictures, Show, bounded
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 SETTINGS = RenderSettings(sh_degree=1)
@@ -88,15 +78,6 @@ def test_no_client_makes_a_picture_of_any_size():
     assert (nothing.width, nothing.height) == (1, VIEW.height)
 
 
-class Draws(RenderStateMachine):
-    """A thread of the viewer's that does something else."""
-
-    def __init__(self, act) -> None:
-        threading.Thread.__init__(self, target=act)
-
-    run = threading.Thread.run
-
-
 DRAWS_TO_THE_END = """
 import threading, torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -123,16 +104,3 @@ def test_a_process_that_still_draws_for_browsers_ends_in_order():
         [sys.executable, "-c", DRAWS_TO_THE_END], capture_output=True, text=True, check=False
     )
     assert (run.returncode, run.stdout) == (0, ""), run.stderr
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"), [(0.0, ""), (0.3, "Waiting for the viewer's last picture, 9 s at most.\n")]
-)
-def test_who_waits_for_a_picture_is_told(monkeypatch, capsys, seconds, said):
-    monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_OF_SILENCE", 0.1)
-    monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_TO_END", 9.1)
-    thread = Draws(lambda: time.sleep(seconds))
-    thread.start()
-    end_drawing()
-    assert not thread.is_alive()
-    assert capsys.readouterr().out == said

@@ -12,14 +12,7 @@ from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer.status import BlockRow, Status, status_of, time_left
-from abcd_ns.viewer.texts import (
-    MOST_ROWS,
-    block_table,
-    clock,
-    headline,
-    memory_table,
-    worker_line,
-)
+from abcd_ns.viewer.texts import MOST_ROWS, block_table, clock, memory_table, worker_line
 
 
 def test_a_block_is_untrained_then_active_then_done():
@@ -86,5 +79,4 @@ def test_words():
     )
     assert worker_line(waiting) == "Worker 2: is starting; 0 visits"
     assert (clock(3725.9), clock(None)) == ("1:02:05", "unknown")
-    assert headline("Block 3", 0.25, 90.0) == "**Block 3**  \n25% of the run, 0:01:30 left"
     assert memory_table([("RAM", 3 * 2**29, 2**34)]).splitlines()[2:] == ["| RAM | 1.5 GiB | 16.0 GiB |"]

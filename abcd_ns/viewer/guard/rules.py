@@ -36,24 +36,17 @@ _TEXT = re.compile(r"\w[\w.-]{0,99}")
 
 @dataclass
 class Rules:
-    """What one server answers to.
-
-    Args:
-        host: the name or address that the server was told to listen on.
-        share: whether viser's public tunnel may be used.
-        element: finds a GUI element of viser's by its id; None where there is none.
-    """
+    """What one server answers to."""
 
     host: str
+    """The name or address that it listens on."""
     share: bool = False
+    """Whether viser's public tunnel may be used."""
     element: Callable[[str], Any] = lambda _: None
+    """Returns a GUI element of viser's by its id, or None."""
 
     def refusal(self, path: str, headers: Any) -> str | None:
-        """Why a request is not answered, for a person to read; None if it is.
-
-        Args:
-            headers: of the package websockets.
-        """
+        """Why a request is refused, for a person to read; None if it is answered."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self.knows(hosts[0]):
             return f"the Host {_quoted(hosts)} is not this viewer's"
@@ -80,7 +73,7 @@ class Rules:
         return self.share and name.endswith(SHARE_DOMAIN)
 
     def admits(self, message: Any) -> bool:
-        """Whether to act on a message of viser's protocol that a client sent: only on those named here."""
+        """Whether to act on a client's message: only on those named here."""
         match type(message).__name__:
             case "ViewerCameraMessage":
                 return is_camera(message)
@@ -104,10 +97,7 @@ def plain_path(path: str) -> bool:
 
 
 def fits(element: Any, value: Any) -> bool:
-    """Whether a client may give a GUI element this value: it is enabled, and the value is of its kind.
-
-    Kinds are switches and buttons, numbers, vectors, choices among options, and text.
-    """
+    """Whether a client may give a GUI element this value: it is enabled, and the value is of its kind."""
     match element.value:
         case _ if element.disabled:
             return False
@@ -150,7 +140,7 @@ def _own_names() -> tuple[str, ...]:
 
 
 def content_policy(host: str) -> str:
-    """A Content-Security-Policy under which the viewer's page talks to its own server and to nobody else.
+    """A Content-Security-Policy by which the viewer's page talks to its own server alone.
 
     viser's page asks a tracker for a script, and nerfstudio's title bar its site for a picture.
     """

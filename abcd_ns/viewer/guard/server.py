@@ -28,36 +28,27 @@ _rules: dict[int, Rules] = {}
 _told: set[str] = set()
 
 
-def install() -> bool:
-    """Guard every viser server that is started from now on; harmless when done again.
-
-    Returns:
-        Whether they are guarded. If not, a warning was printed: this viser is not 0.2.
-    """
+def install() -> None:
+    """Guard every viser server that starts from now on; print a warning if this viser is not 0.2."""
     importlib.import_module("viser")
-    # Its private module: looked up by name, so that another viser costs a warning and no import.
     infra = sys.modules.get("viser.infra._infra")
     package = getattr(infra, "websockets", None)
     if isinstance(package, _Overlay):
-        return True
+        return
     if not hasattr(infra, "WebSocketServerProtocol") or not hasattr(package, "server"):
         CONSOLE.print(
             f"[bold yellow]warning:[/] the viewer is unguarded: viser {version('viser')} is built otherwise "
             "than 0.2. Use --vis tensorboard on a machine that others use, too."
         )
-        return False
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of the older API, which is viser's choice
         serve = package.server.serve
     infra.websockets = _Overlay(package, server=_Overlay(package.server, serve=guarded(serve)))
-    return True
 
 
 def rules_of(server: Any) -> Rules | None:
-    """The rules of a running `viser.ViserServer`; None if it was started before `install`.
-
-    Clients can set GUI elements from the first call on: before it the rules know none.
-    """
+    """The rules of a `viser.ViserServer`, which then know its GUI elements; None if it is unguarded."""
     rules = _rules.get(server.get_port())
     if rules is not None:
         rules.element = partial(_element, server)
@@ -85,8 +76,8 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
                 return None
             status, fields, content = found
             policy = content_policy(headers["Host"])
-            fields = {**fields, "Content-Security-Policy": policy, "X-Content-Type-Options": "nosniff"}
-            return status, fields, content
+            extra = {"Content-Security-Policy": policy, "X-Content-Type-Options": "nosniff"}
+            return status, {**fields, **extra}, content
 
         def read(connection: Any) -> Any:
             return handler(_Reader(connection, rules))
