@@ -33,9 +33,9 @@ from abcd_ns.nerfstudio.views import place_cameras
 from abcd_ns.units import GIB
 
 BATCH = "abcd_batch"
-"""The key of a camera's metadata under which what to train on travels from here to the model."""
+"""The key of a camera's metadata that holds what the model trains on."""
 TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
-"""What readers end with where data is not what they expect."""
+"""What readers raise where data is not what they expect."""
 
 OUR_READER = "abcd-data"
 READERS: dict[str, DataParserConfig] = {
@@ -43,7 +43,7 @@ READERS: dict[str, DataParserConfig] = {
     **{name: config for name, config in all_dataparsers.items() if name != OUR_READER},
     "nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True),  # as splatfacto has it
 }
-"""What reads data, as splatfacto offers it, by the name on the command line."""
+"""What reads data, by the name on the command line."""
 DataFormat = tyro.conf.OmitSubcommandPrefixes[
     tyro.extras.subcommand_type_from_defaults(READERS, prefix_names=False) | None
 ]
@@ -66,18 +66,14 @@ UNUSED = {
 
 
 def reader_name(config: DataParserConfig) -> str:
-    """The name of a reader on the command line; of one that nerfstudio does not know, its class's."""
+    """The name of a reader on the command line, or of its class where it has none."""
     kind = type(config)
     return next((name for name, known in READERS.items() if type(known) is kind), kind.__name__)
 
 
 @contextmanager
 def reading(config: DataParserConfig) -> Iterator[None]:
-    """Put what a reader stumbles over into a sentence.
-
-    Raises:
-        InputError: the body ended with what readers end with.
-    """
+    """Turn what a reader raises into an InputError of one sentence."""
     name = reader_name(config)
     try:
         yield
@@ -105,7 +101,7 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     data_format: DataFormat = None
     """What reads the data, if not abcd-data. Its own options follow its name."""
     cache_images: Literal["cpu", "gpu"] = "cpu"
-    """Of no use: see UNUSED. nerfstudio would speak of it where it is "gpu"."""
+    """Unused, see UNUSED. nerfstudio prints a line where it is "gpu"."""
     photo_cache_gb: float = 0.0
     """RAM for decoded photos, GiB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
 
@@ -120,29 +116,29 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
         self.dataparser, self.data_format = self.data_format, None
 
     def reader(self) -> DataParserConfig:
-        """What reads the data, told where it is."""
+        """What reads the data, with its folder."""
         return self.dataparser if self.data is None else replace(self.dataparser, data=self.data)
 
 
 class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
-    """The subset of cameras, the crop and the layers come from the coordinator; the photo from here."""
+    """Serves the photos of what the coordinator trains on."""
 
     config: AbcdDataManagerConfig
     train_dataset: AbcdDataset
     eval_dataset: AbcdDataset
 
     device_photo_bytes: int = 0
-    """Of decoded training photos and masks that may be kept on the device; of the others, crops are copied
-    there for each step. Of no use on the CPU."""
+    """For decoded training photos and masks on the device, where it is no CPU. Of others, crops are copied
+    there in each step."""
     scored: int | None = None
-    """Held-out views that scores are of; None for all."""
+    """Number of held-out views to score; None for all."""
 
     def __init__(self, config: AbcdDataManagerConfig, *args: Any, **kwargs: Any) -> None:
         self._coordinator: Trainer | None = None
         self._on_device: dict[tuple[str, int], torch.Tensor] = {}
         self._used = 0
         self._parts: list[Batch] = []
-        # Ours says itself what is wrong with data; what else it ends with is a fault of ours.
+        # Ours says itself what is wrong with data; other errors are its bugs.
         reader = config.reader()
         with nullcontext() if reader_name(reader) == OUR_READER else reading(reader):
             super().__init__(config, *args, **kwargs)
@@ -158,7 +154,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self.test_mode != "inference")
 
     def create_eval_dataset(self) -> AbcdDataset:
-        """The held-out photos; looked at one after the other, so none is kept."""
+        """The held-out photos; none is kept in RAM."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         if not has_views(outputs):
             say("No held-out view can be used: scores are of the training views.", "yellow")
@@ -166,27 +162,23 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self._dataset(outputs, 0)
 
     def follow(self, coordinator: Trainer) -> None:
-        """Serve what this coordinator asks for from now on."""
+        """Serve this coordinator from now on."""
         self._coordinator = coordinator
         coordinator.announce.subscribe(self.read_ahead)
 
     def take_poses(self, poses: Mapping[int, torch.Tensor]) -> None:
-        """Put training cameras where they were refined to, and held-out ones of the same photos with them.
-
-        Args:
-            poses: world to camera, by row of the training photos.
-        """
+        """Move cameras of both splits to refined poses: world to camera, by row of the training photos."""
         rows = {path: row for row, path in enumerate(self.train_dataset.image_filenames)}
         for dataset in (self.train_dataset, self.eval_dataset):
             known = ((row, rows.get(path, -1)) for row, path in enumerate(dataset.image_filenames))
             place_cameras(dataset.cameras, {row: poses[own] for row, own in known if own in poses})
 
     def photo(self, row: int, crop: Crop) -> torch.Tensor:
-        """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
+        """Pixels of a training photo on the device: float32 [h, w, 3 or 4] in 0..1."""
         return self._pixels("image", row, crop).float() / 255
 
     def target(self, sample: Sample) -> Target:
-        """What a sample is trained on: its photo, composited on its background, and its mask."""
+        """A sample's photo, composited on its background, and its mask."""
         shot = sample.view.index, sample.source
         photo = sample.reduced(self.photo(*shot))
         if photo.shape[-1] == 4:  # as splatfacto's model composites
@@ -194,13 +186,13 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return photo, sample.reduced_mask(self._pixels("mask", *shot))
 
     def read_ahead(self, event: Event) -> None:
-        """Begin to read photos that are wanted soon and not on the device; a CPU has its threads busy."""
+        """Begin to read photos that are wanted soon, except on a CPU, whose threads are busy."""
         if isinstance(event, PhotosWanted) and torch.device(self.device).type != "cpu":
             rows = (row for row in event.views if ("image", row) not in self._on_device)
             self.train_dataset.photos.expect(rows)
 
     def _pixels(self, kind: Literal["image", "mask"], row: int, crop: Crop) -> torch.Tensor | None:
-        """A crop on the device, of what is kept there, or copied while it goes on; None for no mask."""
+        """A crop on the device, of what is kept there or copied; None for no mask."""
         kept = self._on_device.get((kind, row))
         if kept is not None:
             return kept[crop.slices]
@@ -215,8 +207,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return kept[crop.slices]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
-        """The next part of a step's batch: its first camera with all of it in the metadata, and the crops of
-        the photos."""
+        """The next part of a step's batch: its first camera, with all in the metadata, and its photos."""
         self._parts = self._parts or list(self._coordinator.next_batch().parts())
         samples = self._parts.pop(0)
         rows = [sample.view.index for sample in samples.samples]
@@ -230,7 +221,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     @property
     def is_within_step(self) -> bool:
-        """Whether `next_train` will give more of the same step."""
+        """Whether `next_train` has more of the same step."""
         return bool(self._parts)
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002
@@ -239,7 +230,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     @property
     def fixed_indices_eval_dataloader(self) -> DataLoader:
-        """Held-out cameras and photos in order, read one at a time: all, or `scored` of them."""
+        """Held-out cameras and photos in order, read one at a time: all or `scored`."""
         held_out, own = range(len(self.eval_dataset)), torch.Generator()  # a loader draws a seed
         rows = evenly(held_out, len(held_out) if self.scored is None else self.scored)
         return DataLoader(rows, batch_size=None, collate_fn=self._held_out, generator=own)

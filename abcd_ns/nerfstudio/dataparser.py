@@ -41,13 +41,12 @@ class AbcdDataParserConfig(SceneOptions):
     train_split_fraction: float = 0.9
     """Share of the views that is trained on by "fraction"."""
     as_stored: tyro.conf.Suppress[bool] = False
-    """Give the cameras of the files as they lie on the disk, distortion included: for methods that read
-    photos by nerfstudio's means."""
+    """Return the cameras of the files, distortion included, for methods of nerfstudio's own."""
 
 
 @dataclass
 class AbcdDataparserOutputs(DataparserOutputs):
-    """Keeps the way back to the original coordinates in float64: geo-referenced ones need the digits."""
+    """Transforms back to original coordinates in float64: geo-referenced ones need the digits."""
 
     def transform_poses_to_original_space(
         self, poses: Float[Tensor, "n 3 4"], camera_convention: Literal["opengl", "opencv"] = "opencv"
@@ -59,11 +58,7 @@ class AbcdDataparserOutputs(DataparserOutputs):
 
 
 class AbcdDataParser(DataParser):
-    """Reads the scene at the first call for a split; constructing it touches no file.
-
-    Raises (from `get_dataparser_outputs`):
-        InputError: the input cannot be used; all bad files are listed.
-    """
+    """Reads the scene at the first call for a split; constructing it touches no file."""
 
     config: AbcdDataParserConfig
     includes_time = False
@@ -71,7 +66,7 @@ class AbcdDataParser(DataParser):
     def __init__(self, config: AbcdDataParserConfig):
         super().__init__(config)
         self.downscale_factor: int | None = None
-        """nerfstudio sets it to 1 where a trained scene is viewed or exported: photos may then be absent."""
+        """nerfstudio sets 1 where a trained scene is viewed or exported: photos may then be absent."""
         self._prepared: Prepared | None = None
 
     @property
@@ -83,7 +78,7 @@ class AbcdDataParser(DataParser):
         """The whole scene, read and checked at the first call.
 
         Raises:
-            InputError: the input cannot be used.
+            InputError: the input cannot be used; all bad files are listed.
         """
         if self._prepared is None:
             options = self.config
@@ -99,11 +94,7 @@ class AbcdDataParser(DataParser):
         say(one_line(note), "yellow")
 
     def rows(self, split: str) -> list[int]:
-        """Rows of the prepared scene's lists that belong to a split; see `split_rows`.
-
-        Raises:
-            InputError: as `prepared` and `split_rows`.
-        """
+        """Rows of the prepared scene's lists that belong to a split; see `split_rows`."""
         scene = self.prepared().scene
         if scene.split_lists and self.config.eval_mode == "auto":
             return scene.split_lists.rows([frame.name for frame in scene.frames], split)
@@ -136,11 +127,8 @@ def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataPa
         split: "train", or "val" or "test" for the views held out.
 
     Raises:
-        InputError: eval_interval below 2.
-        ValueError: no such split.
+        InputError: eval_interval is below 2, or a split would be empty.
     """
-    if split not in ("train", "val", "test"):
-        raise ValueError(f"There is no split {split}; there are train, val and test.")
     count = len(centers)
     if config.eval_mode == "all":
         return list(range(count))
@@ -162,7 +150,7 @@ def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataPa
 
 
 def sector(centers: Float[np.ndarray, "n 3"], count: int) -> frozenset[int]:
-    """`count` rows: of the camera that is outermost where they spread most, and of those nearest to it."""
+    """`count` rows: the outermost camera along the longest axis, and those nearest to it."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     outermost = int(np.abs(offsets @ axes[0]).argmax())
@@ -171,7 +159,7 @@ def sector(centers: Float[np.ndarray, "n 3"], count: int) -> frozenset[int]:
 
 
 def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:
-    """What is trained on: cameras [len(rows)] of reduced, undistorted photos."""
+    """Cameras [len(rows)] of reduced, undistorted photos."""
     poses = np.stack([prepared.scene.frames[row].camera_to_world for row in rows])
     poses = torch.from_numpy(prepared.similarity.poses(poses))
     return pinhole_cameras([prepared.lenses[row] for row in rows], poses)

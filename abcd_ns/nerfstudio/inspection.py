@@ -25,7 +25,7 @@ SOME_MEANS = 1000
 
 @dataclass(frozen=True)
 class Inspected:
-    """A capture, as far as memory hangs on it."""
+    """What a run's memory and start depend on."""
 
     train: int
     """Views to train on."""
@@ -96,7 +96,7 @@ def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found
 
 
 def _check_place(path: Path, means: Float64[Tensor, "n 3"], found: Inspected) -> None:
-    """See that most of these are as near to the points as Gaussians are that were trained from them."""
+    """Check that most of these are as near to the points as Gaussians trained from them would be."""
     cloud = found.cloud[np.isfinite(found.cloud).all(axis=1)]
     if not len(cloud) or not len(means):
         return
@@ -114,19 +114,18 @@ def where_data_is(data: Path | None, config: Path) -> Path | None:
     Raises:
         UserError: nowhere.
     """
-    places = [] if data is None else [base / data for base in (Path(), *config.absolute().parents)]
-    for place in places:
-        if place.exists():
-            return place
-    if places:
-        raise UserError(
-            f"{data}, on which this run was trained, does not exist: put it back, or a link to where it is "
-            f"now (ln -s NEW_PLACE {data})."
-        )
-    return None
+    if data is None:
+        return None
+    for base in (Path(), *config.absolute().parents):
+        if (base / data).exists():
+            return base / data
+    raise UserError(
+        f"{data}, on which this run was trained, does not exist: put it back, or a link to where it is now "
+        f"(ln -s NEW_PLACE {data})."
+    )
 
 
 def factor_of(parser: DataParser) -> int:
-    """By which the photos' width and height are divided, once the parser has read; 1 if it does not say."""
+    """By which a parser that has read divides the photos' width and height; 1 if it does not say."""
     given = (getattr(parser, name, None) for name in ("factor", "downscale_factor", "_downscale_factor"))
     return int(next((factor for factor in given if factor), 1))

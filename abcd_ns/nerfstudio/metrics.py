@@ -26,8 +26,8 @@ def image_metrics(
 ) -> dict[str, float]:
     """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`; `cc_psnr` if `corrected`.
 
-    SSIM is left out of pictures smaller than its window. With a mask, PSNRs are of the pixels where it is
-    true, and the others of pictures that are black elsewhere.
+    Pictures smaller than SSIM's window have none. With a mask, PSNRs are of the pixels where it is true, and
+    the others of pictures that are black elsewhere.
     """
     a, b = (image.permute(2, 0, 1)[None] for image in (rendered, photo))
     if mask is not None:

@@ -64,24 +64,23 @@ class AbcdModelConfig(SplatfactoModelConfig):
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 
     ownership: tyro.conf.Fixed[Literal["fragments", "means"]] = "fragments"
-    """What a layer holds in composited pictures; taken over from the method's recipe."""
+    """What a layer holds in composited pictures; set by the method's recipe."""
     primitive: tyro.conf.Fixed[PrimitiveName] = "3dgs"
-    """What a Gaussian is; taken over from the run's options."""
+    """What a Gaussian is; set by the run's options."""
 
 
 class AbcdModel(SplatfactoModel):
     """Draws batches for training and whole pictures for evaluation, viewer and export.
 
-    While training, the registered parameters are the active block alone and the rest of the scene is reached
-    through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene,
-    on the device or, where that has no room to draw it at once, on the CPU. `state_dict` gives the merged
-    scene in either case.
+    While training, the registered parameters are the active block alone; the coordinator has the rest of the
+    scene. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene, on the device or,
+    where that cannot draw it at once, on the CPU. `state_dict` returns the merged scene in either case.
     """
 
     config: AbcdModelConfig
 
     def populate_modules(self) -> None:
-        """Register empty parameters; what a run begins with is made when it begins."""
+        """Register empty parameters; a run fills them when it begins."""
         empty = Gaussians.empty(self.config.sh_degree)
         self.gauss_params = ParameterDict({name: Parameter(value) for name, value in empty.items()})
         cameras = {"num_cameras": self.num_train_data, "device": "cpu"}
@@ -89,7 +88,7 @@ class AbcdModel(SplatfactoModel):
         self._tree, self._poses = build_kd(torch.zeros(0, 3), 1), {}
         self.near = NEAR_PLANE
         self.step = 0
-        # For classes derived from this one, as splatfacto has them; here images are measured by `metrics`.
+        # For derived classes, as splatfacto has them; here images are measured by `metrics`.
         self.psnr = psnr
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.crop_box: OrientedBox | None = None
@@ -102,14 +101,14 @@ class AbcdModel(SplatfactoModel):
         self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
 
     def follow(self, coordinator: Trainer) -> None:
-        """From now on the scene is the coordinator's, and the registered parameters its active block."""
+        """The scene is the coordinator's from now on, and the registered parameters its active block."""
         self._coordinator, self._parted = coordinator, None
 
     def draws_with(self) -> Rasterizer:
         """The rasterizer, made on first use."""
         if self._rasterizer is None:
-            config = self.config
-            self._rasterizer = make_rasterizer(config.rasterizer, self.device, primitive=config.primitive)
+            name, primitive = self.config.rasterizer, self.config.primitive
+            self._rasterizer = make_rasterizer(name, self.device, primitive=primitive)
         return self._rasterizer
 
     # -- the scene -----------------------------------------------------------------------------------
@@ -121,7 +120,7 @@ class AbcdModel(SplatfactoModel):
 
     @property
     def poses(self) -> dict[int, Tensor]:
-        """World to camera, by row of the training photos, of those that were refined."""
+        """Refined poses, world to camera, by row of the training photos."""
         return self._poses if self._coordinator is None else self._coordinator.run.poses.refined
 
     @property
@@ -144,8 +143,7 @@ class AbcdModel(SplatfactoModel):
         return self._parted[2]
 
     def merged(self, device: torch.device | str = "cpu") -> Gaussians:
-        """The whole scene in one list, without a graph; while training, on a device. Not a property: it may
-        read everything from disk."""
+        """The whole scene, detached; while training, on `device` and perhaps read from disk."""
         if self._coordinator is None:
             return active_gaussians(self.gauss_params).detach()
         return self._coordinator.scene.everything(device)
@@ -162,11 +160,10 @@ class AbcdModel(SplatfactoModel):
         return state
 
     def load_state_dict(self, state: dict[str, Any], **kwargs: Any) -> None:
-        """As splatfacto's, on the CPU where the scene is too large for the device; torch.load alone would
-        accept altered bytes.
+        """As splatfacto's, but on the CPU where the scene is too large for the device.
 
         Raises:
-            UserError: the Gaussians are not those that were saved.
+            UserError: the Gaussians are not those that were saved; torch.load accepts altered bytes.
         """
         expected = state.get("_extra_state", {}).get("checksum")
         count = len(state["gauss_params.means"])
@@ -182,11 +179,11 @@ class AbcdModel(SplatfactoModel):
             )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the Gaussians do not tell: how space is cut, the near plane, and refined poses."""
+        """What is no parameter: the tree, the near plane and refined poses."""
         return {"tree": self.tree.to_json(), "near": self.near, "poses": self.poses}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over the cut of space, the near plane and refined poses from a checkpoint."""
+        """Take over what `get_extra_state` returned."""
         self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
         self._poses = state.get("poses", {})
@@ -202,10 +199,10 @@ class AbcdModel(SplatfactoModel):
             return self._whole_outputs(self.view(camera))
 
     def view(self, camera: Cameras) -> View:
-        """The camera as the engine draws it: from the scene's near plane on, and on the CPU.
+        """The camera as the engine draws it: on the CPU, from the scene's near plane on.
 
         Raises:
-            UserError: it is no perspective camera. The viewer's, which previews such paths, becomes one.
+            UserError: it is no perspective camera. The viewer, which previews such paths, gets one.
         """
         if not isinstance(camera, Cameras):
             raise UserError("Gaussians are drawn by cameras, not by rays; `abcd mesh RUN` makes a mesh.")
@@ -231,8 +228,7 @@ class AbcdModel(SplatfactoModel):
         return outputs
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """A picture of `get_outputs` without its background, [H, W, 4], alpha not multiplied in: ns-render's
-        `rgba`."""
+        """ns-render's `rgba`: an output without its background, [H, W, 4], alpha not multiplied in."""
         alpha = outputs["accumulation"]
         color = (outputs[output_name] - (1 - alpha) * outputs["background"]) / alpha.clamp_min(1e-10)
         return torch.cat((color.clamp(0, 1), alpha), dim=-1)
@@ -241,8 +237,7 @@ class AbcdModel(SplatfactoModel):
     def draw_merged(self, view: View) -> Raster:
         """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
 
-        Where the device should not hold them all they are drawn node by node, by fragments: these fold to the
-        same picture.
+        Where the device cannot hold them all, fragments are drawn node by node and fold to the same picture.
         """
         training, too_large = self._coordinator, self._loaded_is_too_large
         if training is not None:
@@ -260,7 +255,7 @@ class AbcdModel(SplatfactoModel):
 
     @torch.no_grad()
     def draw_normals(self, view: View) -> Tensor:
-        """Which way what is seen faces in world space, (n + 1) / 2, [H, W, 3]; of what the viewer shows."""
+        """World-space normals of what the viewer shows, (n + 1) / 2, [H, W, 3]."""
         paint = partial(colored_by_normal, view=view, flat=self.config.primitive == "2dgs")
         pictures = self._by_nodes(view, "fragments", keep=lambda g: paint(self._crop(g)), sh_degree=0)
         show = self.choice.show if viewed.asked_by_viewer() else viewed.Show.EVERYTHING
@@ -268,13 +263,13 @@ class AbcdModel(SplatfactoModel):
 
     @torch.no_grad()
     def fog(self, view: View) -> float:
-        """Share of the screen that Gaussians before the view's nearest point take, 0..1."""
+        """Share of the screen covered by Gaussians before the view's nearest point, 0..1."""
         pictures = self._by_nodes(view, "fragments", keep=lambda g: fog_in_white(g, view), sh_degree=0)
         return float(pictures.draw(viewed.Show.EVERYTHING, None).color.mean())
 
     @torch.no_grad()
     def draw_median(self, view: View) -> Tensor:
-        """The depth at which half of each pixel is covered, [H, W, 1]; of the whole scene."""
+        """The depth at which half of each pixel is covered, [H, W, 1]."""
         pictures = self._by_nodes(view, "fragments")
         return median_depth(pictures.renderer, view, pictures.settings)[..., None]
 
@@ -286,7 +281,7 @@ class AbcdModel(SplatfactoModel):
         return self._by_nodes(view, self.config.ownership).draw(choice.show, block)
 
     def _chosen_block(self) -> int | None:
-        """Which block the viewer's user chose to see; None for none that there is."""
+        """The block that the viewer's user chose; None if there is no such block."""
         block = self.choice.block
         if block is None and self._coordinator is not None:
             active = self._coordinator.state.active
@@ -302,30 +297,25 @@ class AbcdModel(SplatfactoModel):
         keep: Callable[[Gaussians], Gaussians] | None = None,
         sh_degree: int | None = None,
     ) -> viewed.BlockPictures:
-        """Draws the scene by parts: of Gaussians what `keep` gives, or those in the crop box."""
+        """Draws the scene by parts: what `keep` leaves of its Gaussians, or those in the crop box."""
         whole = self.scene()
         if isinstance(whole, StoredScene) and whole.is_active_as_a_whole:
-            whole = MemoryScene(whole.tree, self.merged())  # or nobody knows which block holds how many
+            whole = MemoryScene(whole.tree, self.merged())  # whose blocks are known
         shown = keep or self._crop
         scene = ChangedScene(whole, lambda _, found: shown(found))
-        most = min(default_pass(scene), self._most_at_once())
-        renderer = LayerRenderer(
-            scene,
-            self.draws_with(),
-            ownership=ownership,
-            pass_gaussians=most if pass_gaussians is None else pass_gaussians,
-            device=self.device,
-        )
-        settings = self._settings(sh_degree)
+        if pass_gaussians is None:
+            pass_gaussians = min(default_pass(scene), self._most_at_once())
+        options = {"ownership": ownership, "pass_gaussians": pass_gaussians, "device": self.device}
+        renderer = LayerRenderer(scene, self.draws_with(), **options)
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
-        return viewed.BlockPictures(renderer, view, settings, training.recipe.window_weight)
+        return viewed.BlockPictures(renderer, view, self._settings(sh_degree), training.recipe.window_weight)
 
     def _settings(self, sh_degree: int | None = None) -> RenderSettings:
         degree = self.config.sh_degree if sh_degree is None else sh_degree
         return RenderSettings(degree, self.config.rasterize_mode == "antialiased")
 
     def _most_at_once(self) -> int:
-        """Gaussians that the device could draw at once, beside what it holds."""
+        """Gaussians that the device's free memory allows to draw at once."""
         of_each = drawing_bytes(self.config.sh_degree, self.config.primitive)
         return int(FREE_SHARE * free_bytes(self.device)) // of_each
 
@@ -337,9 +327,9 @@ class AbcdModel(SplatfactoModel):
     # -- loss and metrics ----------------------------------------------------------------------------
 
     def get_metrics_dict(self, outputs: Values, batch: Values) -> Values:
-        """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene.
+        """PSNR, a batch's mean, and the number of Gaussians in the scene.
 
-        The mean squared error of each picture is left in `outputs`, for the pipeline to take.
+        The mean squared error of each picture is left in `outputs` for the pipeline.
         """
         pictures, photos = self._pairs(outputs, batch)
         errors = outputs["errors"] = squared_errors(pictures, photos)
@@ -371,9 +361,9 @@ class AbcdModel(SplatfactoModel):
         return found, {"img": torch.cat([photo, picture], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """A photo as float32 in 0..1 on the device; samples have theirs reduced already."""
+        """A photo as float32 in 0..1 on the device; photos of samples are float already."""
         return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
 
     def get_training_callbacks(self, *_: Any, **__: Any) -> list[TrainingCallback]:
-        """None: the pipeline's callbacks drive the coordinator, which does what splatfacto's would."""
+        """None: the pipeline's drive the coordinator."""
         return []

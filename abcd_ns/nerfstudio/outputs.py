@@ -1,4 +1,4 @@
-"""What a model says of a whole picture: what nerfstudio's tools read, and what is drawn when one asks."""
+"""A model's outputs under the names that nerfstudio's tools read."""
 
 from collections import UserDict
 from collections.abc import Callable, Iterable, KeysView, Mapping
@@ -14,11 +14,11 @@ from abcd_ns.engine.types import Layer
 
 
 class Outputs(UserDict[str, Tensor]):
-    """Outputs by name, some of which are drawn when they are first read. Names are there from the start.
+    """Outputs by name, some of which are drawn when they are first read.
 
     Args:
-        drawn: those that are there; the first is what a viewer opens with.
-        later: what draws the others.
+        drawn: those that are there.
+        later: draw the others.
     """
 
     def __init__(self, drawn: Mapping[str, Tensor], later: Mapping[str, Callable[[], Tensor]]) -> None:
@@ -28,13 +28,13 @@ class Outputs(UserDict[str, Tensor]):
         self._later = dict(later)
 
     def draw(self, names: Iterable[str]) -> None:
-        """Draw these now, if there are such."""
+        """Draw those of these names that are not drawn yet."""
         for name in names:
             if name in self._later:
                 self[name] = self._later.pop(name)()
 
     def keys(self) -> KeysView[str]:
-        """The names alone: ns-render prints this, and a `UserDict`'s would print all numbers."""
+        """The names: ns-render prints them, and `UserDict.keys` would print all values."""
         return self.data.keys()
 
     def __getitem__(self, name: str) -> Tensor:
@@ -43,12 +43,7 @@ class Outputs(UserDict[str, Tensor]):
 
 
 def pictured(layer: Layer, raster: Raster, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
-    """A picture under splatfacto's names.
-
-    Args:
-        layer: its colours.
-        raster: its depth.
-    """
+    """A picture with the colours of `layer` and the depth of `raster`, under splatfacto's names."""
     transmittance = layer.transmittance[..., None]
     alpha = 1 - raster.transmittance[..., None]
     # Where nothing is, splatfacto shows the farthest depth of the picture.
@@ -62,7 +57,7 @@ def pictured(layer: Layer, raster: Raster, background: Float[Tensor, "3"]) -> di
 
 
 def rendered_outputs(batch: Batch, rendered: Rendered) -> dict[str, Any]:
-    """A training batch's pictures under the same names, in lists, and what they came from."""
+    """A training batch's pictures under the same names, in lists, with batch and rendering."""
     return {
         "rgb": list(rendered.pictures),
         "background": [sample.background for sample in batch.samples],

@@ -44,7 +44,7 @@ from abcd_ns.viewer.panel import AbcdPanel
 SCORING_SHARE = 0.05
 """Of a run's training time, for scores of held-out views: half of it before the end."""
 LEAST_SCORED = 32
-"""Held-out views that a score is the mean of, at least, if there are more."""
+"""Held-out views that a score is the mean of, at least."""
 
 
 @shown(
@@ -73,8 +73,7 @@ class AbcdPipeline(VanillaPipeline):
         mirror(config.training, config.model)
         if not config.datamanager.photo_cache_gb:
             config.datamanager.photo_cache_gb = max(RamShares.of(config.ram_budget_gb).photos, 1) / GIB
-        # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
-        guard.install()
+        guard.install()  # ns-viewer and ns-train start their viewers later
         with as_a_command():
             check_tool(sys.argv)
             if (opens := opened(sys.argv)) is not None:
@@ -83,26 +82,25 @@ class AbcdPipeline(VanillaPipeline):
             if not len(self.datamanager.eval_dataset):
                 check_held_out(sys.argv)
         self.coordinator: Trainer | None = None
-        """Drives the training, once it has begun."""
+        """Drives the training once it has begun."""
         self._drawn: list[Rendered] = []
         self._view_seconds = self._scoring_seconds = 0.0
         data = self.datamanager.train_dataset
         self.panel = AbcdPanel(self.model, lambda: views_of(data.cameras), lambda row: data.photos.image(row))
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Everything exists by now, checkpoint included: begin or resume, and drive the coordinator."""
+        """Begin or resume, as everything exists by now, and drive the coordinator."""
         trainer = attributes.trainer
         self.coordinator = self._begin(trainer, attributes.optimizers.optimizers)
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
         write_settings(trainer.config, trainer.asked, trainer.folder)
-        photos, resumed_from = self.datamanager.train_dataset.photos, trainer.resumed_from
-        log = keep_log(self.coordinator, photos, trainer.folder, resumed_from)
+        photos = self.datamanager.train_dataset.photos
+        log = keep_log(self.coordinator, photos, trainer.folder, trainer.resumed_from)
         report = ProgressReport(self.coordinator, log.visits)
         self.coordinator.announce.subscribe(report)
         self.coordinator.announce.subscribe(log)
         self.panel.follow(self.coordinator, log)
-        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:
             self._after_step()
@@ -120,14 +118,15 @@ class AbcdPipeline(VanillaPipeline):
             report.close()
             log.close()
 
+        at = TrainingCallbackLocation
         return [
-            TrainingCallback(after, end_step),
-            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], end_run),
+            TrainingCallback([at.AFTER_TRAIN_ITERATION], end_step),
+            TrainingCallback([at.AFTER_TRAIN], end_run),
         ]
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """As VanillaPipeline's, of a step's parts in turn; the last one's gradient is left to take.
-        Keeps what the coordinator must be told after the step."""
+        """As VanillaPipeline's, for a step's parts in turn; runs backward for all but the last.
+        Keeps what the coordinator needs after the step."""
         self._errors, earlier = [], 0.0
         while True:
             outputs, losses, metrics = super().get_train_loss_dict(step)
@@ -141,7 +140,7 @@ class AbcdPipeline(VanillaPipeline):
             loss = sum(losses.values())
             loss.backward()
             earlier = earlier + loss.detach()
-            del outputs, losses, loss  # before more is drawn
+            del outputs, losses, loss  # frees memory for the next part
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
@@ -152,8 +151,7 @@ class AbcdPipeline(VanillaPipeline):
         return found
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As VanillaPipeline's; while training, it is no training time, listeners are told, and of many views
-        a sample is scored."""
+        """As VanillaPipeline's; while training, no time counts, and of many views a sample is scored."""
         self._before_evaluation()
         self.datamanager.scored, began = self._views_to_score(), time.monotonic()
         with as_a_command():
@@ -169,7 +167,7 @@ class AbcdPipeline(VanillaPipeline):
         return found
 
     def _views_to_score(self) -> int | None:
-        """Of the held-out views, as many as SCORING_SHARE has time for; None for all."""
+        """Number of held-out views that SCORING_SHARE has time for; None for all."""
         if self.coordinator is None or not self._view_seconds:
             return None
         of_run, there = self.coordinator.stopwatch.seconds, len(self.datamanager.eval_dataset)
@@ -200,17 +198,22 @@ class AbcdPipeline(VanillaPipeline):
     # -- set-up --------------------------------------------------------------------------------------
 
     def _begin(self, trainer: Any, optimizers: dict[str, Any]) -> Trainer:
-        """Begin or resume; from now on the model draws from its near plane on."""
+        """Begin or resume, and give the model its near plane."""
         manager, model, views = self.datamanager, self.model, self.training_views()
         model.near = views[0].near
         manager.device_photo_bytes = photo_bytes(self.config, self.device)
-        first = partial(self._first_cloud, views)
-        photos, factor = manager.train_dataset.image_filenames, factor_of(manager.dataparser)
         elsewhere = model.config.random_init or model.config.init_splats is not None
-        points = 0 if elsewhere else len(self._cloud[0])
+        capture = Capture(
+            views,
+            manager.train_dataset.image_filenames,
+            manager.target,
+            partial(self._first_cloud, views),
+            0 if elsewhere else len(self._cloud[0]),
+            factor_of(manager.dataparser),
+        )
         return begin_run(
             self.config,
-            Capture(views, photos, manager.target, first, points, factor),
+            capture,
             self.device,
             trainer.folder / STORE,
             Budget(trainer.total_steps, self.config.max_seconds),
@@ -228,11 +231,11 @@ class AbcdPipeline(VanillaPipeline):
 
     @property
     def _cloud(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points of the capture and their colours; none where it has none."""
+        """Points of the capture and their colours, if it has any."""
         return self.model.seed_points or (torch.zeros(0, 3), torch.zeros(0, 3))
 
     def _first_cloud(self, views: list[View]) -> PointCloud | Gaussians:
-        """Those of a file, or at the points of the capture or, as splatfacto's, at random places."""
+        """The Gaussians of a file, or one at each point of the capture or at random places."""
         model, training, (points, colors) = self.model.config, self.config.training, self._cloud
         if model.init_splats is not None:
             read = self.datamanager.train_dataparser_outputs

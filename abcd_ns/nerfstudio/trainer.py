@@ -23,19 +23,19 @@ from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, hidden, opened, shown
-from abcd_ns.nerfstudio.inspection import Inspected, inspect, splats_to_begin_with
+from abcd_ns.nerfstudio.inspection import inspect, splats_to_begin_with
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.resuming import check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_resume, next_steps
 from abcd_ns.run import STATE, STORE
-from abcd_ns.run.fit import Demand, device_budget, find_fit
+from abcd_ns.run.fit import device_budget, fit_run
 from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 UNLIMITED_STEPS = 10**8
-"""From so many on the number of steps means that seconds end the run."""
+"""From this many steps on, seconds end the run."""
 
 
 @hidden("max_norm", "fused")
@@ -49,9 +49,9 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 
 def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerConfig:
-    """Options of the viewer, on this machine alone unless the command line names a host.
+    """The viewer's options, on this machine alone unless the command line names a host.
 
-    ns-viewer replaces a run's viewer section by its own options, whose default is to listen on all networks.
+    ns-viewer replaces a run's by its own, whose default is to listen on all networks.
     """
     flags = ("--viewer.websocket-host", "--viewer.websocket_host")
     named = any(argument.partition("=")[0] in flags for argument in arguments)
@@ -100,7 +100,7 @@ class AbcdTrainerConfig(TrainerConfig):
         return super().get_base_dir() if config is None else config.parent
 
     def get_checkpoint_dir(self) -> Path:
-        """As nerfstudio's, which fails with a traceback where a command opens a run without checkpoints."""
+        """As nerfstudio's; a command that opens a run without checkpoints ends in one line."""
         folder = super().get_checkpoint_dir()
         with as_a_command():
             if opened(sys.argv) is not None and not any(folder.glob("step-*.ckpt")):
@@ -110,7 +110,7 @@ class AbcdTrainerConfig(TrainerConfig):
         return folder
 
     def print_to_terminal(self) -> None:
-        """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
+        """One line instead of nerfstudio's some hundred; all of it is in config.yml."""
         pipeline = self.pipeline
         what = f"{self.method_name} on {pipeline.datamanager.reader().data}"
         seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
@@ -130,8 +130,7 @@ class AbcdTrainerConfig(TrainerConfig):
             raise SystemExit(2) from None
 
     def check(self) -> None:
-        """Choose the device, and look at the options, the folder, what the run goes on from, and the data,
-        before anything is written.
+        """Choose the device, and check options, folder, what is resumed and data before anything is written.
 
         Exits with code 2 and one line for each fault that the user can repair.
         """
@@ -141,42 +140,35 @@ class AbcdTrainerConfig(TrainerConfig):
             why = "No CUDA device was found" if device == "cuda" else "MPS devices are not supported"
             say(f"{why}: training on the CPU.")
         with exit_on_user_error():
-            start, model = find_start(self), self.pipeline.model
-            check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
+            start, pipeline, model = find_start(self), self.pipeline, self.pipeline.model
+            check_start(start, self.get_base_dir() / STATE / STORE, pipeline.blocks)
             check_options(self)
             if start and start.step > self.max_num_iterations:
                 raise UserError(
                     f"The run is at step {start.step:,} already: give --max-num-iterations above that."
                 )
-            found = inspect(self.pipeline.datamanager.reader())
+            found = inspect(pipeline.datamanager.reader())
             say(found.in_words())
-            splats = 0 if start else splats_to_begin_with(model, self.pipeline.training, found)
-            if self.pipeline.blocks == 0:
-                self._check_fit(found, splats)
-
-    def _check_fit(self, found: Inspected, splats: int) -> None:
-        """See that some block fits on the device."""
-        pipeline, model = self.pipeline, self.pipeline.model
-        points = splats or (0 if model.random_init else found.points) or model.num_random
-        device = self.machine.device_type
-        most, of_photos = pipeline.training.density.limit, {"factor": found.factor, "on_cpu": device == "cpu"}
-        demand = Demand(found.pixels, points, pipeline.training, most, **of_photos)
-        find_fit(device_budget(pipeline.device_budget_gb, device), demand)
+            splats = 0 if start else splats_to_begin_with(model, pipeline.training, found)
+            if pipeline.blocks == 0:
+                points = splats or (0 if model.random_init else found.points) or model.num_random
+                device = torch.device(self.machine.device_type)
+                budget = device_budget(pipeline.device_budget_gb, device)
+                fit_run(pipeline, budget, found.pixels, found.factor, points, device)
 
 
 class AbcdTrainer(Trainer):
     """Saves the merged scene for nerfstudio's tools and pins the same moment in the parameter store.
 
-    Upstream, resuming drops Adam's state and trains the full count of steps again; here it goes on at the
-    very step and within the visit that was under way. Ctrl-C and SIGTERM commit before the process ends.
+    Upstream, resuming drops Adam's state and trains all steps again; here it continues at the same step of
+    the same visit. Ctrl-C and SIGTERM commit before the process ends.
     """
 
     config: AbcdTrainerConfig
     pipeline: AbcdPipeline
     resumed_from: Start | None = None
-    """What this run goes on from."""
     _trains: int | None = None
-    """The thread that does."""
+    """The thread that trains."""
 
     def __init__(self, config: AbcdTrainerConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -184,18 +176,18 @@ class AbcdTrainer(Trainer):
         """Steps of the whole run, those before a resume included."""
         config.pipeline.training.seed = config.machine.seed
         self.asked = flat_options(config)
-        """The options as they were asked for, by dotted name: `config` has what follows from them, too."""
+        """The options as given, by dotted name: `config` is changed later."""
         self._signals = StopSignals()
 
     @property
     def folder(self) -> Path:
-        """For all that is ours, in the run's folder."""
+        """ABCD's own, in the run's folder."""
         return self.base_dir / STATE
 
     @property
     def training_state(self) -> str:
-        """Of the viewer's buttons. nerfstudio's loop asks before each step and, while it is paused, again and
-        again: no time of the run counts then."""
+        """Set by the viewer's buttons. nerfstudio's loop reads it again and again while the run is paused: no
+        time counts then."""
         if self._training_state == "paused" and threading.get_ident() == self._trains:
             self.pipeline.coordinator.pause()
         return self._training_state
@@ -206,8 +198,7 @@ class AbcdTrainer(Trainer):
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can repair ends the process with one line and code 2."""
-        said = "Stopped before training began."
-        with at_once(partial(self._say_that_it_ended, said)), exit_on_user_error():
+        with at_once(partial(self._say_end, "Stopped before training began.")), exit_on_user_error():
             super().setup(*args, **kwargs)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
         at = TrainingCallbackLocation
@@ -217,15 +208,10 @@ class AbcdTrainer(Trainer):
         self.callbacks = [hold, *self.callbacks, release, after]
 
     def train(self) -> None:
-        """As nerfstudio's; a signal, or what the user can repair, ends the process and says how to go on."""
+        """As nerfstudio's; a signal, or what the user can repair, ends the process and says how to resume."""
         self._trains = threading.get_ident()
-        said = "Stopped at once; what was written until then is safe."
-        with at_once(partial(self._say_that_it_ended, said)):
+        with at_once(partial(self._say_end, "Stopped at once; what was written until then is safe.")):
             self._train()
-
-    def _say_that_it_ended(self, said: str) -> None:
-        say(said)
-        self._log_how_to_resume()
 
     def _train(self) -> None:
         try:
@@ -237,8 +223,7 @@ class AbcdTrainer(Trainer):
                 self._save_at_stop()
             self._end_report()
             name, step = stopped.received.name, self.pipeline.coordinator.state.step
-            said = f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost."
-            self._say_that_it_ended(said)
+            self._say_end(f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost.")
             raise SystemExit(128 + stopped.received) from None  # as shells expect
         except (UserError, torch.cuda.OutOfMemoryError) as error:
             self._end_report()
@@ -248,17 +233,17 @@ class AbcdTrainer(Trainer):
             except StoreError as refused:
                 if not isinstance(error, StoreError):
                     print_error(str(refused))
-            self._log_how_to_resume()
+            self._say_end()
             raise SystemExit(2) from None
         except Exception:
-            with suppress(StoreError):  # what went wrong first is what matters
+            with suppress(StoreError):  # the first error matters
                 self.pipeline.coordinator.scene.flush()
             raise
         finally:
             self.pipeline.coordinator.dismiss()
 
     def _save_at_stop(self) -> None:
-        """Save at once, since a stopped run may not get long; then again, with visits under way."""
+        """Save at once, since a stopped process may be killed; then again, with visits under way."""
         coordinator = self.pipeline.coordinator
         coordinator.save()
         if coordinator.state.in_flight:
@@ -267,7 +252,7 @@ class AbcdTrainer(Trainer):
             coordinator.save()
 
     def _complete(self) -> None:
-        """A run that has had its steps or seconds takes no more; what comes after may be missing."""
+        """Finish a run that has had its steps or seconds, but not all that comes after."""
         if self.pipeline.coordinator.progress >= 1.0:
             self._signals.hold()
             self.pipeline.coordinator.complete()
@@ -298,7 +283,7 @@ class AbcdTrainer(Trainer):
             super()._train_complete_viewer()
 
     def _may_stop(self, event: Event) -> None:
-        # They may take long, and nothing could be lost meanwhile.
+        # These may take long, and nothing could be lost meanwhile.
         if isinstance(event, (LayersDrawn, Pruning, WorkersSeen)):
             self._signals.check()
 
@@ -306,19 +291,18 @@ class AbcdTrainer(Trainer):
         for callback in self.callbacks:
             callback.run_callback_at_location(self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
 
-    def _log_how_to_resume(self) -> None:
+    def _say_end(self, said: str | None = None) -> None:
+        """Say that the run ended, and the command that resumes it if there is one."""
+        if said is not None:
+            say(said)
         command = command_to_resume(sys.argv, self.config.method_name, self.checkpoint_dir)
-        if command is None or not has_begun(self.folder / STORE):
-            return  # the caller knows better, or there is nothing to go on from yet
-        say(f"To go on:\n  {command}")
+        if command is not None and has_begun(self.folder / STORE):
+            say(f"To go on:\n  {command}")
 
     def _say_what_is_next(self) -> None:
         over = self.pipeline.coordinator.finished and self._training_state == "completed"
-        # Where the process quits by itself a script goes on.
-        if over and not self.config.viewer.quit_on_train_completion:
-            data = self.config.pipeline.datamanager.reader().data
-            method, trainer = self.config.method_name, self.pipeline.coordinator
-            say("\n".join(["Next:", *next_steps(trainer, method, data, self.checkpoint_dir)]))
+        if over and not self.config.viewer.quit_on_train_completion:  # else a script goes on
+            say(next_steps(self.base_dir, self.config.pipeline.datamanager.reader().data))
 
     # -- checkpoints ---------------------------------------------------------------------------------
 
@@ -335,7 +319,7 @@ class AbcdTrainer(Trainer):
         say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
 
     def _update_viewer_state(self, step: int) -> None:
-        """As nerfstudio's, which lets a client that goes away, or sends nonsense, end the run."""
+        """As nerfstudio's, but a client that goes away, or sends nonsense, does not end the run."""
         try:
             super()._update_viewer_state(step)
         except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -345,11 +329,11 @@ class AbcdTrainer(Trainer):
         """Save the merged scene for nerfstudio's tools, and everything else in the store.
 
         Raises:
-            UserError: the disk refused; the run can still be gone on with.
+            UserError: the disk refused; the run can still be resumed.
         """
         coordinator = self.pipeline.coordinator
         coordinator.pause()
-        # Steps of workers are counted here one after the other, but taken in visit by visit.
+        # Steps of workers are counted here one by one, but committed visit by visit.
         step = max(coordinator.state.step - 1, 0)
         coordinator.save(pin=pin_name(step))
         crash_points.reached(crash_points.CHECKPOINT_PINNED)
@@ -359,15 +343,10 @@ class AbcdTrainer(Trainer):
         _save_atomically({"step": step, "pipeline": self.pipeline.state_dict(), **state}, path)
         crash_points.reached(crash_points.CHECKPOINT_IN_PLACE)
         if self.config.save_only_latest_checkpoint:
-            self._forget_all_but(path)
-
-    def _forget_all_but(self, kept: Path) -> None:
-        store = self.pipeline.coordinator.scene.store
-        for old in self.checkpoint_dir.glob("step-*.ckpt"):
-            if old != kept:
+            for old in {*self.checkpoint_dir.glob("step-*.ckpt")} - {path}:
                 old.unlink(missing_ok=True)
-        for pin in store.pins:
-            if pin != kept.stem:
+            store = coordinator.scene.store
+            for pin in {*store.pins} - {path.stem}:
                 store.unpin(pin)
 
 
@@ -377,8 +356,7 @@ def _save_atomically(state: dict[str, Any], path: Path) -> None:
     Raises:
         UserError: the disk refused.
     """
-    # Not beside it: nerfstudio takes every file there for a checkpoint.
-    run = path.parent.parent
+    run = path.parent.parent  # nerfstudio takes every file beside it for a checkpoint
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for leftover in run.glob(f".step-*.ckpt*{TEMPORARY_SUFFIX}"):  # of a run that was killed

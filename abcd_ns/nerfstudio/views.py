@@ -46,10 +46,5 @@ def views_of(cameras: Cameras) -> list[View]:
 
 
 def training_views(cameras: Cameras, points: Float[Tensor, "n 3"] | None, near: float = 0.0) -> list[View]:
-    """All cameras, as a scene is trained with them.
-
-    Args:
-        points: what the capture knows of its scene.
-        near: from where on they see; 0 finds that by the points.
-    """
+    """All cameras, as a scene is trained with them; `near` 0 finds the near plane by the points."""
     return as_trained(views_of(cameras), torch.zeros(0, 3) if points is None else points.cpu(), near)

@@ -1,4 +1,4 @@
-"""Workers that Ray starts: what is asked for, and what each reads when it starts."""
+"""Workers that Ray starts: checks of their options, and what each reads when it starts."""
 
 import copy
 from functools import partial
@@ -18,7 +18,7 @@ from abcd_ns.run.fit import BLOCKS_EACH, works_at_once
 
 
 def check_workers(config: TrainerConfig) -> None:
-    """Look at what is asked for, before anything is written.
+    """Check the options of workers.
 
     Raises:
         UserError: workers are of no use, or cannot be had.
@@ -43,11 +43,7 @@ def check_workers(config: TrainerConfig) -> None:
 
 
 def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int) -> Workers:
-    """Workers of a run with a GPU each, or on the machines of a cluster.
-
-    Args:
-        count: of them.
-        budget: bytes of each worker's device that training may take.
+    """`count` workers of a run, with a GPU each or on a cluster; `budget` is the bytes of each one's device.
 
     Raises:
         WorkersError: they cannot be had.
@@ -81,7 +77,7 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
     """In a worker's process: photos, rasterizer and options of the run.
 
     Raises:
-        UserError: the data is not to be found where the run's driver has it, or is another.
+        UserError: the data differs from the driver's.
     """
     device = torch.device("cuda" if config.machine.device_type == "cuda" else "cpu")
     data = config.pipeline.datamanager.setup(device=device, test_mode="val", world_size=1, local_rank=0)

@@ -60,14 +60,14 @@ def train(
     """Train a scene as `ns-train abcd` does.
 
     Args:
-        views: the cameras in one world space. Their `index` and `near` are set here.
-        photos: one of each view, of its size. A sequence may read them when they are asked for.
-        points: of structure from motion: places in world space, and colours 0..255.
-        out: a folder for the run. The blocks are kept there, in `abcd/store`, as they are trained.
+        views: cameras in one world space. Their `index` and `near` are set here.
+        photos: one for each view, of its size. A sequence may read them when they are asked for.
+        points: places in world space, and colours 0..255.
+        out: folder of the run. Blocks are kept in its `abcd/store` as they are trained.
         steps: optimisation steps for the whole scene.
         options: None for the defaults.
         device: None for a GPU if there is one.
-        listener: is told what happens, see `abcd_ns.engine.events`.
+        listener: called with each event of `abcd_ns.engine.events`.
 
     Raises:
         UserError: photos and views do not match, an option is out of range, `out` holds a run already, or
@@ -77,8 +77,8 @@ def train(
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     training, (places, colors) = options.training, points
     _check(views, photos, options, device, folder)
-    numbered = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
-    views = as_trained(numbered, places, options.near_plane)
+    views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
+    views = as_trained(views, places, options.near_plane)
 
     def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         pixels = photos[index][crop.slices]
@@ -114,12 +114,11 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     device: torch.device | str | None = None,
 ) -> Float[Tensor, "h w 3"]:
-    """A picture of a trained scene, 0..1, on the device.
+    """A picture of a trained scene, 0..1, on the device: None for a GPU if there is one.
 
     Args:
         view: any camera in the world space of the training views.
-        background: what is seen where nothing is.
-        device: None for a GPU if there is one.
+        background: colour where nothing is.
     """
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     gaussians, placed = scene.gaussians.to(device), replace(view.to("cpu"), near=scene.near)

@@ -35,27 +35,16 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_blocks, independent_trainer
-from abcd_ns.run.fit import (
-    COARSE_MODEL,
-    FITTED,
-    Demand,
-    Fit,
-    RamShares,
-    blocks_to_begin_with,
-    device_budget,
-    find_fit,
-    fit_gaussians,
-    has_workers,
-    number_of_workers,
-)
+from abcd_ns.run import fit
+from abcd_ns.run.fit import COARSE_MODEL, FITTED, RamShares
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
 
 Say = Callable[[str], None]
 """Takes lines for the user."""
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
-"""Starts workers on GPUs or other machines. Takes what they have in common, their number, and the bytes of
-each one's device that training may take."""
+"""Starts workers on GPUs or other machines, from their common setup, their number, and the bytes of a device
+that training may take."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +54,13 @@ class Capture:
     views: list[View]
     """The training views, by row."""
     photos: Sequence[Path]
-    """Their photos; a run resumes on photos of the same names and sizes alone."""
+    """Their files; a run resumes only on photos of the same names and sizes."""
     target: Callable[[Sample], Target]
-    """Gives what a sample is trained on."""
+    """Returns what a sample is trained on."""
     cloud: Callable[[], PointCloud | Gaussians]
-    """Makes what a new run begins with: Gaussians, which are trained already, where there is no warm-up."""
+    """Makes what a new run begins with: Gaussians are trained already and have no warm-up."""
     points: int
-    """That the capture has; 0 where the run begins with others."""
+    """Of the capture; 0 where the run begins with others."""
     factor: int = 1
     """By which the photos' width and height were divided."""
 
@@ -123,7 +112,7 @@ def begin_run(
         UserError: nothing fits on the device; `folder` holds another run's store; or `start` was made for
             something else.
     """
-    device_bytes = device_budget(options.device_budget_gb, device)
+    device_bytes = fit.device_budget(options.device_budget_gb, device)
     rasterizer.warm_up()
     loss.warm_up(device)
     training = options.training
@@ -140,12 +129,15 @@ def begin_run(
         if start is not None and options.blocks == 0 and options.device_budget_gb > 0:
             # It resumes with a budget of its own; else it keeps the limits that it began with.
             there, blocks = sum(map(store.counts, range(tree.num_blocks))), tree.num_blocks
-            fitted |= _fit(options, capture, device, device_bytes, there, blocks).limits
+            allowed = fit.fit_run(
+                options, device_bytes, capture.pixels, capture.factor, there, device, blocks
+            )
+            fitted |= allowed.limits
         training = replace(training, limits=replace(training.limits, **fitted))
         if start is not None:
             cut_stored(scene, RunState.from_json(store.state), training.limits)
-        views = capture.views
-        run = TrainingRun(training, budget, scene, views, rasterizer, params, optimizers, device=device)
+        drawn = rasterizer, params, optimizers
+        run = TrainingRun(training, budget, scene, capture.views, *drawn, device=device)
         trainer = _trainer_of(run, options, capture, device_bytes, remote)
         if start is not None:
             trainer.restore()
@@ -168,7 +160,7 @@ def _trainer_of(
     room = LayerRoom(ram) if on_cpu else LayerRoom(int(LAYER_SHARE * device_bytes), ram)
     # Where RAM is short, one process: each reads blocks for itself.
     wanted = options.workers or int(options.ram_budget_gb > 0)
-    count = number_of_workers(wanted, blocks, run.config, device)
+    count = fit.number_of_workers(wanted, blocks, run.config, device)
     if blocks == 1 or (count == 1 and options.cluster is None):
         return Coordinator(run, room=room, target=target)
     # Workers that share a device share its room for layers.
@@ -178,40 +170,6 @@ def _trainer_of(
         workers = ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, device))
         return Dispatcher(run, workers, count, room, target)  # nothing travels for long: no slack is needed
     return Dispatcher(run, remote(setup, count, device_bytes), None, room, target)
-
-
-# -- what fits -----------------------------------------------------------------------------------------
-
-
-def _fit(
-    options: RunOptions,
-    capture: Capture,
-    device: torch.device,
-    device_bytes: int,
-    gaussians: int,
-    blocks: int = 1,
-) -> Fit:
-    """How many blocks for a scene that begins or resumes with so many Gaussians in so many blocks."""
-    training, on_cpu = options.training, device.type == "cpu"
-    limit = training.density.limit
-    demand = Demand(capture.pixels, gaussians, training, limit, capture.factor, blocks, on_cpu)
-    if options.gaussian_bytes:
-        return fit_gaussians(options.gaussian_bytes, demand)
-    return find_fit(device_bytes, demand)
-
-
-def _coarse_model_size(
-    options: RunOptions, capture: Capture, gaussians: int, blocks: int, fitted: dict[str, int]
-) -> int | None:
-    """Gaussians that the warm-up may have; None where there is no warm-up."""
-    training = options.training
-    if training.warmup == 0 or blocks == 1 or training.recipe.exact or training.recipe.overlap > 0:
-        return None
-    # Blocks grow to hold as many Gaussians as there were points, and so may the coarse model.
-    grown = max(min(capture.points, training.density.limit or capture.points), gaussians)
-    largest = fitted["block_limit"] or -(-grown // blocks)
-    training = replace(training, limits=replace(training.limits, **fitted))
-    return coarse_model_size(training, largest, 0 if options.gaussian_bytes else capture.pixels)
 
 
 # -- the store -----------------------------------------------------------------------------------------
@@ -231,10 +189,10 @@ def _new_store(
     cloud = _first_cloud(capture, training, say)
     blocks, fitted = options.blocks, {name: getattr(training.limits, name) for name in FITTED}
     if blocks == 0:
-        fit = _fit(options, capture, device, device_bytes, len(cloud))
-        say(fit.in_words())
-        workers = options.workers if has_workers(options) else 0
-        blocks, fitted = blocks_to_begin_with(fit, workers), fit.limits
+        allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), device)
+        say(allowed.in_words())
+        workers = options.workers if fit.has_workers(options) else 0
+        blocks, fitted = fit.blocks_to_begin_with(allowed, workers), allowed.limits
     if options.partition == "kd":
         tree = build_kd(cloud.means, blocks)
     else:
@@ -251,11 +209,25 @@ def _new_store(
     return store
 
 
+def _coarse_model_size(
+    options: RunOptions, capture: Capture, gaussians: int, blocks: int, fitted: dict[str, int]
+) -> int | None:
+    """Gaussians that the warm-up may have; None where there is no warm-up."""
+    training = options.training
+    if training.warmup == 0 or blocks == 1 or training.recipe.exact or training.recipe.overlap > 0:
+        return None
+    # Blocks grow to hold as many Gaussians as there were points, and so may the coarse model.
+    grown = max(min(capture.points, training.density.limit or capture.points), gaussians)
+    largest = fitted["block_limit"] or -(-grown // blocks)
+    training = replace(training, limits=replace(training.limits, **fitted))
+    return coarse_model_size(training, largest, 0 if options.gaussian_bytes else capture.pixels)
+
+
 def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointCloud | Gaussians:
-    """No more than the scene may have."""
-    everything, points = capture.cloud(), capture.points
-    if len(everything) < points:
-        merged = f"merged {points:,} points closer than these photos resolve"
+    """What the run begins with, thinned out to what the scene may have."""
+    everything = capture.cloud()
+    if len(everything) < capture.points:
+        merged = f"merged {capture.points:,} points closer than these photos resolve"
         say(f"Starting with {len(everything):,} Gaussians: {merged}.")
     kept = thin_out(everything, training.density.limit, training.seed)
     if len(kept) < len(everything):

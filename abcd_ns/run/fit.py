@@ -13,13 +13,7 @@ from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import (
-    PHOTO_SHARE,
-    DeviceNeeds,
-    fewest_blocks,
-    free_on_gpu,
-    levels_of,
-)
+from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
@@ -33,16 +27,10 @@ FREE_SHARE = 0.9
 """Of a GPU's free memory: the rest is for what the allocator cannot use."""
 RAM_SHARE = 0.25
 """Of the machine's RAM, where the CPU is the device."""
-MOST_RAM = 8 << 30
-"""Bytes: of the automatic budget for what could be read or drawn again."""
-KEPT_SHARE = 0.4
-"""Of the machine's RAM for the same, where that is less."""
-LEAST_BLOCK = 1_000
-"""A block with room for fewer Gaussians is not worth a visit."""
+LEAST_BLOCK, LEAST_LIMIT = 1_000, 100
+"""Gaussians: a block with room for fewer is not worth a visit. The second holds for `gaussian_bytes`."""
 FEW = 4
 """Blocks: each step trains one, so where there would be more, fewer harmonics make them fewer."""
-LEAST_LIMIT = 100
-"""The same where the budget is for Gaussians alone, which small scenes are compared by."""
 PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000
@@ -51,7 +39,6 @@ FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gauss
 """The limits that follow from the device's memory; a run keeps them."""
 COARSE_MODEL = "coarse_gaussians"
 """Another, of the warm-up's memory."""
-BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64
 """No larger factor is proposed."""
 BLOCKS_EACH = 2
@@ -63,7 +50,7 @@ class Fit:
     """What a budget allows."""
 
     blocks: int
-    """To begin with: as few as hold the initial Gaussians. Those that outgrow their room are cut in two."""
+    """To begin with: as few as hold the initial Gaussians."""
     limit: int
     """Gaussians in a block at most, where there are several; 0 where there is no room for several."""
     sole: int
@@ -73,13 +60,10 @@ class Fit:
     gaussians: int
     """Expected in the whole scene at the end."""
     crop_pixels: int = 0
-    """Pixels of a view in a step at most; 0 is no limit."""
     batch: int = 1
-    """Views that are drawn at once, at most; 0 is no limit."""
     pass_gaussians: int = 0
-    """Frozen Gaussians that are drawn at once, at most; 0 is as many as usual."""
     late_harmonics: int = 0
-    """See Limits."""
+    """These four: see Limits."""
 
     @property
     def blocks_at_the_end(self) -> int:
@@ -102,17 +86,17 @@ class Fit:
         if not self.limit:
             grows = "there is no room for the layers of more, and the scene stops growing at that."
         budget = f"{bytes_in_words(self.budget)} of the device allow {limit:,} Gaussians in a block"
-        notes = []
+        said = f"{budget}: {blocks} to begin with; {grows}"
         if self.crop_pixels:
-            notes.append(f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels.")
+            said += f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels."
         if self.late_harmonics:
             late = "highest degree" if self.late_harmonics == 1 else f"{self.late_harmonics} highest degrees"
-            notes.append(f" Harmonics of the {late} come after growth.")
-        return f"{budget}: {blocks} to begin with; {grows}{''.join(notes)}"
+            said += f" Harmonics of the {late} come after growth."
+        return said
 
 
 def device_budget(wanted_gb: float, device: torch.device | str) -> int:
-    """Bytes of the device that training may take: what is wanted, or with 0 what there is."""
+    """Bytes of the device that training may take; a wanted 0 takes a share of what is free."""
     if wanted_gb > 0:
         return int(wanted_gb * GIB)
     if (device := torch.device(device)).type == "cuda":
@@ -136,18 +120,18 @@ class Demand:
     blocks: int = 1
     """That there are already."""
     on_cpu: bool = False
-    """Whether the CPU is the device: then layers and photos are kept under another budget."""
+    """Whether layers and photos are kept in RAM, under a budget of their own."""
     late_harmonics: int = 0
     """See Limits."""
 
     @property
     def first(self) -> int:
-        """Gaussians in the beginning."""
+        """Gaussians at the start."""
         return self.points if self.most is None else min(self.points, self.most)
 
     @property
     def gaussians(self) -> int:
-        """Gaussians in the end."""
+        """Gaussians expected at the end."""
         return self.most or EXPECTED_GROWTH * self.points
 
     def reduced(self, times: int) -> "Demand":
@@ -156,11 +140,11 @@ class Demand:
 
     @property
     def at_once(self) -> int:
-        """Views that are drawn at once: one where nothing is said, for memory is what cuts a scene."""
+        """Views that are drawn at once: one unless a limit is set, since memory is what cuts a scene."""
         return self.training.limits.batch_limit or 1
 
     def needs(self, blocks: int, crop_pixels: int, levels: int) -> DeviceNeeds:
-        """What that takes in one block or several; see DeviceNeeds."""
+        """What that takes in one block or several."""
         training, views = self.training, views_per_step(self.training.batch, blocks)
         at_once = min(views, self.at_once)
         options = (training.sh_degree, crop_pixels, levels, not self.on_cpu, training.primitive)
@@ -168,17 +152,42 @@ class Demand:
         return DeviceNeeds(self.pixels, at_once, *options, views - at_once, degree)
 
     def with_fewer_harmonics(self) -> Iterator["Demand"]:
-        """The same with all degrees of harmonics while blocks grow, and with ever fewer."""
+        """The same with all degrees of harmonics while blocks grow, then with ever fewer."""
         return (replace(self, late_harmonics=late) for late in range(self.training.sh_degree + 1))
 
     def most_beside(self, limit: int) -> int:
-        """Frozen Gaussians that a pass may draw beside a block at its limit. The least room for them is where
-        it has all its harmonics, and so fewer Gaussians."""
+        """Frozen Gaussians that a pass may draw beside a block at its limit, with all its harmonics."""
         needs, whole = (replace(self, late_harmonics=n).needs(2, 0, 0) for n in (self.late_harmonics, 0))
         return whole.frozen_beside(limit * needs.gaussian_bytes // whole.gaussian_bytes)
 
 
-def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = BUDGET_FLAG) -> Fit:
+def fit_run(
+    options: RunOptions,
+    budget: int,
+    pixels: int,
+    factor: int,
+    gaussians: int,
+    device: torch.device,
+    blocks: int = 1,
+) -> Fit:
+    """What a run's options allow, on a device that has `budget` bytes for it; the rest is Demand's.
+
+    Raises:
+        UserError: there is no room for any block worth a visit; says what would help.
+    """
+    training, room = options.training, options.gaussian_bytes
+    demand = Demand(pixels, gaussians, training, training.density.limit, factor, blocks, device.type == "cpu")
+    if not room:
+        return find_fit(budget, demand)
+    if (fit := _best(_fit_gaussians(room, each) for each in demand.with_fewer_harmonics())) is None:
+        limit = room // demand.needs(2, 0, levels=0).gaussian_bytes
+        raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
+    return fit
+
+
+def find_fit(
+    budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = "--pipeline.device-budget-gb"
+) -> Fit:
     """The fewest blocks whose visits stay within `budget` bytes.
 
     Where whole views leave no room, steps draw parts. One block needs no room for layers.
@@ -187,24 +196,11 @@ def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory:
         downscale, memory: the options by which photos are reduced and more memory is given.
 
     Raises:
-        UserError: the budget has no room for any block worth a visit; says what would help.
+        UserError: there is no room for any block worth a visit; says what would help.
     """
     each = list(demand.with_fewer_harmonics())
     if (fit := _best(_fit(budget, one) for one in each)) is None:
         raise UserError(_refusal(budget, each[-1], downscale, memory))
-    return fit
-
-
-def fit_gaussians(room: int, demand: Demand) -> Fit:
-    """The fewest blocks whose Gaussians take no more than `room` bytes, pictures and layers apart.
-
-    Raises:
-        UserError: they would have next to none.
-    """
-    fits = (_fit_gaussians(room, each) for each in demand.with_fewer_harmonics())
-    if (fit := _best(fits)) is None:
-        limit = room // demand.needs(2, 0, levels=0).gaussian_bytes
-        raise UserError(f"{bytes_in_words(room)} have room for {limit} Gaussians: give more, or more points.")
     return fit
 
 
@@ -219,6 +215,7 @@ def _best(fits: Iterable[Fit | None]) -> Fit | None:
 
 
 def _fit_gaussians(room: int, demand: Demand) -> Fit | None:
+    """The fewest blocks whose Gaussians take no more than `room` bytes, pictures and layers apart."""
     training = demand.training
     sole, limit = (room // demand.needs(blocks, 0, levels=0).gaussian_bytes for blocks in (1, 2))
     if limit < LEAST_LIMIT:
@@ -231,7 +228,7 @@ def _fit_gaussians(room: int, demand: Demand) -> Fit | None:
 
 
 def _fit(budget: int, demand: Demand) -> Fit | None:
-    """As `find_fit`; None where nothing fits."""
+    """As `find_fit` with these harmonics; None where nothing fits."""
     crop = _crop(budget, demand)
     # A single block has no neighbours, so it may be larger.
     sole = demand.needs(1, crop, levels=0).block_limit(budget)
@@ -269,20 +266,19 @@ def _fewest(gaussians: int, limit: int, sole: int) -> int:
 def _refusal(budget: int, demand: Demand, downscale: str, memory: str) -> str:
     """Why nothing fits, and which options would help."""
     least = _least_budget(budget, demand)
-    ways, times = [], 2
+    ways, times = f"more memory by {memory} {least:.2f}, if the device has it", 2
     while times * demand.factor <= MOST_DOWNSCALE and _fit(budget, demand.reduced(times)) is None:
         times *= 2
     if times * demand.factor <= MOST_DOWNSCALE:
-        ways.append(f"smaller photos by {downscale} {times * demand.factor}")
-    ways.append(f"more memory by {memory} {least:.2f}, if the device has it")
+        ways = f"smaller photos by {downscale} {times * demand.factor}, or {ways}"
     return (
         f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GiB of the device, "
-        f"and {budget / GIB:.2f} GiB may be taken: give {', or '.join(ways)}."
+        f"and {budget / GIB:.2f} GiB may be taken: give {ways}."
     )
 
 
 def _least_budget(budget: int, demand: Demand) -> float:
-    """The least that suffices, GiB to two digits."""
+    """The least that suffices, GiB, to two digits."""
     step = GIB // 100
     low = high = budget // step + 1
     while _fit(high * step, demand) is None:
@@ -291,7 +287,7 @@ def _least_budget(budget: int, demand: Demand) -> float:
 
 
 def photo_bytes(options: RunOptions, device: torch.device) -> int:
-    """Of the device, for photos. None on a CPU; none beside workers, of which one shares this device."""
+    """Of the device, for photos: 0 on a CPU, and beside workers, of which one shares this device."""
     if device.type == "cpu" or has_workers(options):
         return 0
     return int(PHOTO_SHARE * device_budget(options.device_budget_gb, device))
@@ -303,13 +299,10 @@ def has_workers(options: RunOptions) -> bool:
 
 
 def blocks_to_begin_with(fit: Fit, workers: int) -> int:
-    """As few as fit the device, but enough for every worker.
-
-    Args:
-        workers: 0 for none, also where one process trains.
+    """As few as fit the device, but enough for every worker; `workers` is 0 where one process trains.
 
     Raises:
-        UserError: they need several blocks, and there is no room for the layers around one.
+        UserError: workers need several blocks, and there is no room for the layers around one.
     """
     if workers and not fit.limit:
         raise UserError(
@@ -325,11 +318,7 @@ def works_at_once(recipe: Recipe) -> bool:
 
 
 def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device | str) -> int:
-    """`RunOptions.workers`, its 0 resolved.
-
-    Args:
-        blocks: of the scene.
-    """
+    """`RunOptions.workers`, its 0 resolved for a scene of that many blocks."""
     if asked:
         return asked
     # Workers learn nothing of light and poses: two of them may show one photo.
@@ -341,7 +330,7 @@ def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device:
 
 @dataclass(frozen=True)
 class RamShares:
-    """Bytes for each place that keeps what could be read or drawn again. None of them changes a result."""
+    """Bytes for what could be read or drawn again. None of them changes a result."""
 
     photos: int
     """Decoded photos."""
@@ -352,11 +341,9 @@ class RamShares:
 
     @staticmethod
     def of(gibibytes: float) -> "RamShares":
-        """A quarter of so many for photos, one for blocks, the rest for layers; 0 is the smaller of 8 and 40%
-        of the machine's memory."""
-        if gibibytes:
-            budget = int(gibibytes * GIB)
-        else:
-            budget = min(MOST_RAM, int(KEPT_SHARE * psutil.virtual_memory().total))
+        """A quarter of them for photos, one for blocks, the rest for layers. 0 takes 8 GiB, or 40% of the
+        machine's memory if that is less."""
+        automatic = min(8 * GIB, int(0.4 * psutil.virtual_memory().total))
+        budget = int(gibibytes * GIB) if gibibytes else automatic
         photos = blocks = budget // 4
         return RamShares(photos, blocks, budget - photos - blocks)

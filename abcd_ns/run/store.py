@@ -56,22 +56,15 @@ class MadeFor:
         return MadeFor(digest.hexdigest(), first_camera, how, *drawn)
 
     def check(self, store: ParameterStore) -> None:
-        """See that `store` was made for the same.
-
-        Raises:
-            UserError: it was not; both are shown.
-        """
-        different = self.differences(store)
-        if different:
+        """Raise a UserError that names what `store` was made for and what is here, where they differ."""
+        if different := self.differences(store):
             why = f"Cannot resume {store.folder}: it was made for {different}"
             raise UserError(f"{why}. Pass its original data and options, or leave out --load-dir.")
 
     def differences(self, store: ParameterStore) -> str:
         """What `store` was made for that is otherwise here, in words; empty where nothing is."""
-        theirs, mine = store.header.get(MADE_FOR), asdict(self)
-        if theirs is None:  # nothing was written down
-            return ""
-        theirs = {**mine, **theirs}  # older versions wrote down less
+        mine = asdict(self)
+        theirs = {**mine, **store.header.get(MADE_FOR, {})}  # older versions wrote down less
         different = [name for name in mine if not _agree(theirs[name], mine[name])]
         return "; ".join(f"{name.replace('_', ' ')} {theirs[name]}, not {mine[name]}" for name in different)
 
@@ -88,9 +81,7 @@ def _agree(theirs: Any, mine: Any) -> bool:
 
 
 def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
-    """Make `folder` the store of a run that goes on from `start`, and open it.
-
-    Where `folder` is the very store that the run goes on from, it is simply opened.
+    """Make `folder` the store of a run that resumes from `start`, if it is not that store, and open it.
 
     Raises:
         UserError: the store cannot be read, or was made for something else; the disk refused; or another run

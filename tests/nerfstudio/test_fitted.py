@@ -24,7 +24,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     monkeypatch.setattr(AbcdDataManager, "photo", noted)
     monkeypatch.setattr(FinalPruning, "is_wanted", False)  # it reads whole photos, and reduces them
     with monkeypatch.context() as patched:
-        patched.setattr("abcd_ns.run.begin.find_fit", lambda *_: FIT)
+        patched.setattr("abcd_ns.run.fit.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
     assert "steps draw parts of 0.0006 megapixels" in capsys.readouterr().out

@@ -2,19 +2,16 @@
 
 import io
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, VisitBegan
 from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import Budget, Stopwatch
+from abcd_ns.engine.train.run_state import Stopwatch
 from abcd_ns.nerfstudio.run import progress
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.stopping import next_steps
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 
@@ -91,20 +88,3 @@ def test_the_end_tells_held_out_psnr_where_it_was_measured_after_the_last_step(c
     said = capsys.readouterr().out
     assert "held-out PSNR 19.50 dB" in said
     assert "crops" not in said
-
-
-def test_what_is_next_names_the_run_and_how_to_train_what_was_not_visited(coordinator, monkeypatch):
-    coordinator.state.views, coordinator.state.visit = {0: 3, 1: 0, 2: 1}, 2
-    coordinator.state.health = {0: BlockHealth(visits=2)}
-    coordinator.run.budget, coordinator.run.stopwatch = Budget(1000, 60.0), Stopwatch(60.0)
-    monkeypatch.setattr(
-        sys, "argv", ["ns-train", "abcd", "--data", "my wall", "--pipeline.max-seconds", "60"]
-    )
-    lines = next_steps(coordinator, "abcd", Path("my wall"), Path("run/nerfstudio_models"))
-    assert "    abcd report run --data 'my wall'" in lines
-    assert "    ns-viewer --load-config run/config.yml" in lines
-    what, command = lines[-2:]
-    assert what == "  Train twice as long, as 1 of 3 blocks were not visited:"
-    assert command.endswith("--load-dir run/nerfstudio_models --pipeline.max-seconds 120 --data 'my wall'")
-    coordinator.state.step = 1000
-    assert "--max-num-iterations 2000" in next_steps(coordinator, "abcd", Path("wall"), Path("run/m"))[-1]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from abcd_ns.nerfstudio.run.stopping import StopSignals, command_to_resume
+from abcd_ns.nerfstudio.run.stopping import StopSignals, command_to_resume, next_steps
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +42,12 @@ def test_handlers_are_put_back():
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):
     assert command_to_resume(argv.split(), "abcd", Path("my run")) == expected
+
+
+def test_what_is_next_are_commands_about_the_run():
+    lines = next_steps(Path("my run"), Path("wall")).splitlines()
+    assert "    abcd report 'my run' --data wall" in lines
+    assert "    ns-viewer --load-config 'my run/config.yml'" in lines
 
 
 def test_in_another_thread_signals_stay_as_they_are():
