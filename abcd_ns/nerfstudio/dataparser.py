@@ -61,7 +61,6 @@ class AbcdDataParser(DataParser):
     """Reads the scene at the first call for a split; constructing it touches no file."""
 
     config: AbcdDataParserConfig
-    includes_time = False
 
     def __init__(self, config: AbcdDataParserConfig):
         super().__init__(config)

@@ -20,19 +20,17 @@ from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
 
 METHODS = "abcd"
-"""What the names of all our methods begin with."""
+"""Start of the names of all our methods."""
 UNUSED_OF_VIEWER = {
     "num_rays_per_chunk": "it is about rays, and Gaussians are not drawn by rays",
     "relative_log_filename": "the viewer writes no log",
 }
-"""Options of nerfstudio's viewer that ABCD has no use for, and why."""
 UNUSED_OF_MACHINE = dict.fromkeys(
     ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
 )
-"""Options of nerfstudio's machine that ABCD has no use for, and why."""
-
+"""Options of nerfstudio's viewer and machine that ABCD has no use for, and why."""
 FOLDERS = ("--output-dir", "--render-output-path")
-"""Flags of ns-export and ns-eval that name folders to be written to."""
+"""Flags of ns-export and ns-eval for folders to write to."""
 
 
 def trains_ours(words: Sequence[str]) -> bool:
@@ -41,18 +39,14 @@ def trains_ours(words: Sequence[str]) -> bool:
 
 
 def opened(words: Sequence[str]) -> Path | None:
-    """The config.yml that ns-eval, ns-viewer, ns-render or ns-export is to open; None of other commands."""
+    """The config.yml that ns-eval, ns-viewer, ns-render or ns-export opens; None for other commands."""
     path = _value(words, "--load-config")
     tool = Path(words[0]).stem
     return Path(path) if path and tool.startswith("ns-") and tool != "ns-train" else None
 
 
 def check_config(words: Sequence[str]) -> None:
-    """See that the config.yml of ours that a command line names is one, before nerfstudio reads it.
-
-    Raises:
-        UserError: it is not; says what to give.
-    """
+    """Raise a UserError if the config.yml of ours that a command line names is none."""
     name = _value(words, "--load-config")
     path = Path(name or "")
     meant = path / "config.yml" if path.is_dir() else path
@@ -72,27 +66,26 @@ def check_config(words: Sequence[str]) -> None:
 
 
 def opens_ours(words: Sequence[str]) -> bool:
-    """Whether a command line opens a run of ours, OUTPUTS/SCENE/METHOD/TIME/config.yml: the path tells."""
+    """Whether a command line opens a run of ours, by the path OUTPUTS/SCENE/METHOD/TIME/config.yml."""
     path = opened(words)
     return path is not None and any(part.startswith(METHODS) for part in path.parts[-3:-2])
 
 
 def as_a_command() -> AbstractContextManager:
-    """Where a command opens a run of ours, end it in one line by what the user can repair.
+    """Where a command opens a run, let a UserError end the process in one line.
 
-    Python that opens one gets the exception, and so does `ns-train`, which has blocks to put on disk first.
+    Python gets the exception, and so does `ns-train`, which has blocks to put on disk first.
     """
     return nullcontext() if opened(sys.argv) is None else exit_on_user_error()
 
 
 def check_tool(words: Sequence[str]) -> None:
-    """See that a command can do with a run of ours what it is asked for, before anything is loaded.
+    """Check a command on a run of ours before anything is loaded.
 
     Raises:
-        UserError: other methods alone can, or a file that is named is of no use.
+        UserError: Gaussians cannot do it, or a path is of no use.
     """
-    config = opened(words)
-    if config is None:
+    if (config := opened(words)) is None:
         return
     tool, what = Path(words[0]).stem, "".join(words[1:2])
     if tool == "ns-export" and what in ("pointcloud", "tsdf", "poisson", "marching-cubes"):
@@ -104,7 +97,7 @@ def check_tool(words: Sequence[str]) -> None:
         raise UserError(f"--output-path {out} must end in .json.")
     folders = [Path(out).parent] if out else []
     folders += [Path(given) for flag in FOLDERS if (given := _value(words, flag))]
-    for folder in folders:  # the tools fail by a traceback, ns-eval at its end
+    for folder in folders:  # the tools end with a traceback, ns-eval after all its work
         there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
         if not there.is_dir() or not os.access(there, os.W_OK):
             why = "is read-only" if there.is_dir() else "is a file"
@@ -113,16 +106,12 @@ def check_tool(words: Sequence[str]) -> None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            refused = f"{path} is no camera path ({error}): make one in the viewer's Render tab."
-            raise UserError(refused) from None
+            why = f"is no camera path ({error}): make one in the viewer's Render tab."
+            raise UserError(f"{path} {why}") from None
 
 
 def check_held_out(words: Sequence[str]) -> None:
-    """See that a command asks for no held-out photos, where a run has none.
-
-    Raises:
-        UserError: it does.
-    """
+    """Raise a UserError if a command asks for held-out photos; for runs that have none."""
     tool, what = Path(words[0]).stem, "".join(words[1:2])
     flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
     if tool == "ns-eval":
@@ -132,11 +121,7 @@ def check_held_out(words: Sequence[str]) -> None:
 
 
 def check_box(words: Sequence[str], means: Float[Tensor, "n 3"]) -> None:
-    """See that the box of `ns-export gaussian-splat` holds something, which nerfstudio takes for granted.
-
-    Raises:
-        UserError: it holds none of the means.
-    """
+    """Raise a UserError if the box of `ns-export gaussian-splat` holds none of the means."""
     given = [_value(words, f"--obb-{name}", 3) for name in ("center", "rotation", "scale")]
     if Path(words[0]).stem == "ns-export" and None not in given:
         box = OrientedBox.from_params(*(tuple(map(float, values.split())) for values in given))
@@ -145,7 +130,7 @@ def check_box(words: Sequence[str], means: Float[Tensor, "n 3"]) -> None:
 
 
 def _value(words: Sequence[str], flag: str, count: int = 1) -> str | None:
-    """What a command line gives for a flag, `count` words; None where it does not name it."""
+    """The `count` words that follow a flag on a command line; None without the flag."""
     flags = [word.partition("=")[0].replace("_", "-") for word in words]
     if flag not in flags:
         return None
@@ -154,7 +139,7 @@ def _value(words: Sequence[str], flag: str, count: int = 1) -> str | None:
 
 
 def hidden(*names: str) -> Callable[[type], type]:
-    """Of a config class, above `@dataclass`: these fields are no flags; files and Python may set them."""
+    """Class decorator above `@dataclass`: these fields are no flags; files and Python may set them."""
 
     def decorate(cls: type) -> type:
         hints = get_type_hints(cls, include_extras=True)
@@ -164,9 +149,9 @@ def hidden(*names: str) -> Callable[[type], type]:
 
 
 def shown(*names: str) -> Callable[[type], type]:
-    """Of a config class, above `@dataclass`: the fields that `ns-train abcd --help` lists, in this order.
+    """Class decorator above `@dataclass`: the fields that `ns-train abcd --help` lists, in this order.
 
-    The other fields are flags as well. tyro lists all that it takes, so they are none while it prints help.
+    Other fields are flags too, except while help is printed: tyro lists all that it takes.
     """
 
     def decorate(cls: type) -> type:
@@ -180,14 +165,14 @@ def shown(*names: str) -> Callable[[type], type]:
 
 
 def named_too(cls: type, flags: Mapping[str, str]) -> None:
-    """Give fields of a config class a second flag each, by the field's name."""
+    """Give fields of a config class, by name, a second flag each."""
     hints = get_type_hints(cls, include_extras=True)
     second = {name: tyro.conf.arg(aliases=[flag]) for name, flag in flags.items()}
     _annotate(cls, {name: Annotated[hints[name], also] for name, also in second.items()})
 
 
 def _annotate(cls: type, annotations: dict[str, Any]) -> type:
-    # tyro reads annotations when it makes its command line; the class itself stays as it was.
+    # tyro reads annotations when it makes its command line.
     cls.__annotations__ = {**cls.__annotations__, **annotations}
     return cls
 

@@ -20,7 +20,7 @@ from abcd_ns.nerfstudio.datamanager import reading
 from abcd_ns.nerfstudio.model import AbcdModelConfig
 
 SOME_MEANS = 1000
-"""Of a file's Gaussians, that are looked for among the points."""
+"""Of a file's Gaussians that are looked for among the points."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,6 @@ class Inspected:
     size: tuple[int, int]
     """Width and height of the largest photo as it is trained on, px."""
     points: int
-    """0 where Gaussians begin at random."""
     factor: int
     """By which the photos' width and height are divided."""
     cloud: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), compare=False)
@@ -43,7 +42,7 @@ class Inspected:
 
     @property
     def pixels(self) -> int:
-        """Of the largest photo as it is trained on."""
+        """Of the largest photo."""
         return self.size[0] * self.size[1]
 
     def in_words(self) -> str:
@@ -76,7 +75,7 @@ def inspect(config: DataParserConfig) -> Inspected:
 
 
 def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found: Inspected) -> int:
-    """Gaussians of the file that a run begins with; 0 without one.
+    """Number of Gaussians in the file that a run begins with; 0 without one.
 
     Raises:
         UserError: it cannot be read, has more than the scene may have, or lies elsewhere than the points.

@@ -32,10 +32,8 @@ PAPER = TrainingConfig(
     density=DensityConfig(min_contribution=0.0),
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
-
-
 PEER_BLOCKS = 8
-"""Of the methods to compare with: they are about blocks, needed or not."""
+"""Of the methods to compare with."""
 
 
 def _method(name: str, description: str, **pipeline) -> MethodSpecification:

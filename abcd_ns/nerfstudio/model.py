@@ -37,7 +37,7 @@ from abcd_ns.nerfstudio.datamanager import BATCH
 from abcd_ns.nerfstudio.flags import as_a_command, hidden, shown
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.options import HIDDEN
-from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
+from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.run.fit import FREE_SHARE
 from abcd_ns.viewer import pictures as viewed
@@ -194,7 +194,9 @@ class AbcdModel(SplatfactoModel):
         """The crops of a training batch where the camera carries one, else the whole picture."""
         batch = (camera.metadata or {}).get(BATCH)
         if self.training and batch is not None:
-            return rendered_outputs(batch, self._coordinator.render(batch))
+            rendered = self._coordinator.render(batch)
+            pictures = {"rgb": list(rendered.pictures), "background": [s.background for s in batch.samples]}
+            return {**pictures, "batch": batch, "rendered": rendered}
         with as_a_command():
             return self._whole_outputs(self.view(camera))
 

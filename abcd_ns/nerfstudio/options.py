@@ -37,8 +37,6 @@ MIRRORED = {
 """The model's options that nerfstudio's tools and viewers read, and those of `training` that set them."""
 HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode", "color_corrected_metrics"}
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
-TOLERATED = {"eval_num_rays_per_chunk"}
-"""ns-render sets it for all methods; pictures of Gaussians are not drawn by rays."""
 SAME = {
     TrainingConfig: {
         "sh_degree": "sh-degree",
@@ -48,8 +46,8 @@ SAME = {
     },
     DensityConfig: {"refine_every": "refine-every", "cull_alpha_thresh": "cull-alpha-thresh"},
 }
-"""By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
-# What makes a method and what memory decides stand in config.yml, and are no options.
+"""By class and field, the flag under --pipeline.model that splatfacto has for it; accepted too."""
+# What makes a method and what memory decides are in config.yml, but no options.
 for _not_offered in (Recipe, Limits):
     tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
 _first = ("primitive", "sh_degree", "background", "light", "poses", "antialiased", "warmup", "density")
@@ -112,24 +110,24 @@ NO_FLAGS = {
     "pipeline.training.recipe": "choose another method; `abcd compare --vary` can change parts of one",
     "pipeline.training.limits": "they follow from --pipeline.device-budget-gb",
 }
-"""By the pattern of their names, what are no flags of `ns-train abcd`, and why."""
+"""What are no flags of `ns-train abcd`, by pattern, and why."""
 HIDDEN = tuple(
     option.name
     for option in dataclasses.fields(SplatfactoModelConfig)
     if option.name not in HONOURED and not option.name.startswith("_")
 )
 """Options of splatfacto's model that have no effect, or are set under other names."""
-
-
-_BUDGETS = ("device_budget_gb", "ram_budget_gb", "datamanager.photo_cache_gb", "gaussian_bytes")
-NOT_BELOW_0 = ("blocks", "near_plane", *_BUDGETS)
+NOT_BELOW_0 = (
+    "blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb",
+    "datamanager.photo_cache_gb",
+)  # fmt: skip
 
 
 def check_options(config: TrainerConfig) -> None:
-    """Look at a run's options, before its data is.
+    """Check a run's options.
 
     Raises:
-        UserError: one is out of range, two contradict each other, or ABCD cannot do what is asked for.
+        UserError: one is out of range or has no effect, or two contradict each other.
     """
     pipeline = config.pipeline
     for name in NOT_BELOW_0:
@@ -150,26 +148,18 @@ def check_options(config: TrainerConfig) -> None:
     check_workers(config)
     if pipeline.training.seed not in (TrainingConfig.seed, config.machine.seed):
         raise UserError(_no_effect("pipeline.training.seed", SEED))
-    refuse_changed(config, UNUSED, "")
-    refuse_changed(config.machine, UNUSED_OF_MACHINE, "machine.")
-    refuse_changed(config.viewer, UNUSED_OF_VIEWER, "viewer.")
-    refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
+    _refuse_changed(config, UNUSED, "")
+    _refuse_changed(config.machine, UNUSED_OF_MACHINE, "machine.")
+    _refuse_changed(config.viewer, UNUSED_OF_VIEWER, "viewer.")
+    _refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():
         if group["optimizer"].max_norm is not None:
             raise UserError(_no_effect(f"optimizers.{name}.optimizer.max_norm", NOT_CLIPPED))
     mirror(pipeline.training, pipeline.model)
 
 
-def refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
-    """See that options without effect are at their defaults.
-
-    Args:
-        unused: why they have none, by name.
-        prefix: of their flags.
-
-    Raises:
-        UserError: one is not.
-    """
+def _refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
+    """Raise a UserError if an option without effect is not at its default; flags begin with `prefix`."""
     defaults = type(config)()
     for name, why in unused.items():
         if getattr(config, name) != getattr(defaults, name):
@@ -177,11 +167,10 @@ def refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
 
 
 def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
-    """See that every flag is an option with an effect; tyro would name other methods' flags.
+    """Check that every flag is an option with an effect; tyro would name other methods' flags.
 
     Args:
-        words: of `ns-train`, after the method's name; what follows the name of a reader is the reader's.
-        config: of the method.
+        words: of `ns-train`, after the method's name. Those after the name of a reader are not checked.
 
     Raises:
         UserError: a flag is none; names the reason, or the nearest option.
@@ -203,24 +192,23 @@ def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
 
 
 def nearest(name: str, known: Iterable[str]) -> list[str]:
-    """The three names most like `name`, by the whole of it or by its last part; splatfacto's come last."""
-    by_end = {each: each.rpartition(".")[2] for each in known}
-    last = name.rpartition(".")[2]
-    same = [each for each, end in by_end.items() if end == last]
-    ends = difflib.get_close_matches(last, sorted(set(by_end.values())), n=3, cutoff=0.8)
-    alike = [each for end in ends for each, known_end in by_end.items() if known_end == end]
-    whole = difflib.get_close_matches(name, by_end, n=3, cutoff=0.8)
-    return sorted(dict.fromkeys([*same, *whole, *alike]), key=lambda each: "model." in each)[:3]
+    """The three names most like `name`, by the last part or the whole; splatfacto's come last."""
+    ends = {each: each.rpartition(".")[2] for each in known}
+    alike = difflib.get_close_matches(name.rpartition(".")[2], sorted({*ends.values()}), n=3, cutoff=0.8)
+    found = [each for end in alike for each in ends if ends[each] == end]
+    found += difflib.get_close_matches(name, ends, n=3, cutoff=0.8)
+    return sorted(dict.fromkeys(found), key=lambda each: "model." in each)[:3]
 
 
 def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
-    """Take over what nerfstudio's tools read from the model's options, and what its user set there.
+    """Set the model's options that nerfstudio's tools read, and take over what the user set there.
 
     Raises:
         UserError: an option of splatfacto was set that ABCD does not use.
     """
-    unused = {name: why for name, why in UNUSED_OF_MODEL.items() if name not in TOLERATED}
-    refuse_changed(model, unused, "pipeline.model.")
+    # ns-render sets this one for all methods.
+    unused = {name: why for name, why in UNUSED_OF_MODEL.items() if name != "eval_num_rays_per_chunk"}
+    _refuse_changed(model, unused, "pipeline.model.")
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
     if model.init_splats is not None:  # trained already, on whole pictures
@@ -234,8 +222,10 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         if name == "rasterize_mode":
             value = "antialiased" if value else "classic"
         if getattr(model, name) not in (value, getattr(defaults, name)):
-            flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
-            raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
+            flag, instead = name.replace("_", "-"), source.replace("_", "-")
+            raise UserError(
+                f"--pipeline.model.{flag} has no effect here; set --pipeline.training.{instead} instead."
+            )
         setattr(model, name, value)
 
 

@@ -2,14 +2,12 @@
 
 from collections import UserDict
 from collections.abc import Callable, Iterable, KeysView, Mapping
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.render import Raster
-from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.types import Layer
 
 
@@ -53,16 +51,6 @@ def pictured(layer: Layer, raster: Raster, background: Float[Tensor, "3"]) -> di
         "depth": depth,
         "accumulation": 1 - transmittance,
         "background": background.expand(*layer.color.shape),
-    }
-
-
-def rendered_outputs(batch: Batch, rendered: Rendered) -> dict[str, Any]:
-    """A training batch's pictures under the same names, in lists, with batch and rendering."""
-    return {
-        "rgb": list(rendered.pictures),
-        "background": [sample.background for sample in batch.samples],
-        "batch": batch,
-        "rendered": rendered,
     }
 
 

@@ -203,14 +203,9 @@ class AbcdPipeline(VanillaPipeline):
         model.near = views[0].near
         manager.device_photo_bytes = photo_bytes(self.config, self.device)
         elsewhere = model.config.random_init or model.config.init_splats is not None
-        capture = Capture(
-            views,
-            manager.train_dataset.image_filenames,
-            manager.target,
-            partial(self._first_cloud, views),
-            0 if elsewhere else len(self._cloud[0]),
-            factor_of(manager.dataparser),
-        )
+        points = 0 if elsewhere else len(self._cloud[0])
+        photos, first = manager.train_dataset.image_filenames, partial(self._first_cloud, views)
+        capture = Capture(views, photos, manager.target, first, points, factor_of(manager.dataparser))
         return begin_run(
             self.config,
             capture,

@@ -32,10 +32,7 @@ from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, comma
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.fit import device_budget, fit_run
 from abcd_ns.run.store import Start
-from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
-
-UNLIMITED_STEPS = 10**8
-"""From this many steps on, seconds end the run."""
+from abcd_ns.viewer.guard import THIS_MACHINE, WILDCARDS
 
 
 @hidden("max_norm", "fused")
@@ -113,10 +110,9 @@ class AbcdTrainerConfig(TrainerConfig):
         """One line instead of nerfstudio's some hundred; all of it is in config.yml."""
         pipeline = self.pipeline
         what = f"{self.method_name} on {pipeline.datamanager.reader().data}"
-        seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
-        steps = f", {self.max_num_iterations:,} steps" if self.max_num_iterations < UNLIMITED_STEPS else ""
         blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
-        say(f"{what}: {blocks}{steps}{seconds}")
+        seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
+        say(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}")
 
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
@@ -271,11 +267,11 @@ class AbcdTrainer(Trainer):
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """As nerfstudio's, without graphs, which no log needs; where workers train, one's doing counts."""
         coordinator = self.pipeline.coordinator
-        if coordinator is None or not coordinator.trains_elsewhere:
-            loss, losses, metrics = super().train_iteration(step)
-            return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
-        coordinator.await_step()
-        return torch.zeros(()), {}, {}
+        if coordinator.trains_elsewhere:
+            coordinator.await_step()
+            return torch.zeros(()), {}, {}
+        loss, losses, metrics = super().train_iteration(step)
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def _train_complete_viewer(self) -> None:
         # All is saved; nerfstudio goes on serving its viewer until Ctrl-C, which is how such a run ends.

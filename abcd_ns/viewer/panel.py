@@ -11,22 +11,21 @@ import torch
 import viser
 import viser.transforms as vtf
 from jaxtyping import UInt8
+from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from abcd_ns.data.input_errors import say
 from abcd_ns.engine import events
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
+from abcd_ns.viewer import texts
 from abcd_ns.viewer.controls import CURVE, Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
 from abcd_ns.viewer.scenery import Scenery, boxes_of, bulk, first_look, nearest_view, views_that_see
-from abcd_ns.viewer.status import BlockRow, Status, status_of, time_left
-from abcd_ns.viewer.texts import block_table, clock, memory_table, reach, worker_line
 
 AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
 """Events that are shown at once; others once in SECONDS_BETWEEN_UPDATES."""
@@ -78,8 +77,8 @@ class AbcdPanel(ViewerControl):
         share, server = viewer.config.make_share_url, viewer.viser_server
         if (rules := rules_of(server)) is not None:
             rules.share = share
-        if not share and (line := reach(viewer.config.websocket_host)) is not None:
-            say(line)
+        if not share and (line := texts.reach(viewer.config.websocket_host)) is not None:
+            CONSOLE.print(line, highlight=False)
         # nerfstudio's title bar fetches a picture from its site; viser's offers everyone a public tunnel.
         look = {"control_layout": "collapsible", "dark_mode": True, "brand_color": (255, 211, 105)}
         server.gui.configure_theme(**look, show_share_button=share)
@@ -143,14 +142,14 @@ class AbcdPanel(ViewerControl):
             self._lay_out()
         self._updated = time.monotonic()
         rows = self._rows()
-        self._controls.write(blocks=block_table(rows), memory=memory_table(self._memory()))
+        self._controls.write(blocks=texts.block_table(rows), memory=texts.memory_table(self._memory()))
         self._scenery.show_boxes({row.block: row.status for row in rows}, self._controls.boxes.value)
         self._show_cameras()
         if self._coordinator is not None:
             self._report(self._coordinator)
 
     def _report(self, coordinator: Trainer) -> None:
-        state, left = coordinator.state, clock(time_left(coordinator))
+        state, left = coordinator.state, texts.clock(texts.time_left(coordinator))
         headline = f"**{self._where(state)}**  \n{coordinator.progress:.0%} of the run, {left} left"
         epoch = f"Epoch {state.epoch}: {len(state.queue)} visits are waiting" if state.queue else ""
         if coordinator.finished and not self._stage:
@@ -167,7 +166,7 @@ class AbcdPanel(ViewerControl):
     def _where(self, state: RunState) -> str:
         active = state.active
         if active is None and self._workers and not self._stage:
-            return "  \n".join(map(worker_line, self._workers))
+            return "  \n".join(map(texts.worker_line, self._workers))
         if active is None and self._coordinator.config.recipe.exact:
             return "All blocks at once"
         if active is None:
@@ -178,18 +177,18 @@ class AbcdPanel(ViewerControl):
             return f"Warm-up of the whole scene, {step}"
         return f"Block {active.geometry.block + 1}, {step}"
 
-    def _rows(self) -> list[BlockRow]:
+    def _rows(self) -> list[texts.BlockRow]:
         scene, blocks = self._model.scene(), range(self._model.tree.num_blocks)
         if self._coordinator is None:
-            state = (Status.UNTRAINED, Status.DONE)
-            return [BlockRow(b, state[scene.count(b) > 0], scene.count(b)) for b in blocks]
+            state = (texts.Status.UNTRAINED, texts.Status.DONE)
+            return [texts.BlockRow(b, state[scene.count(b) > 0], scene.count(b)) for b in blocks]
         if self._coordinator.config.recipe.exact:
-            return [BlockRow(b, Status.ACTIVE) for b in blocks]
+            return [texts.BlockRow(b, texts.Status.ACTIVE) for b in blocks]
         state, active = self._coordinator.state, self._active()
         psnrs = {visit.block: visit.psnr for visit in self._log.visits}
         counts = [None if state.active and state.active.is_whole else scene.count(b) for b in blocks]
         return [
-            BlockRow(b, status_of(b, state, active), counts[b], psnrs.get(b), state.views.get(b))
+            texts.BlockRow(b, texts.status_of(b, state, active), counts[b], psnrs.get(b), state.views.get(b))
             for b in blocks
         ]
 

@@ -13,21 +13,17 @@ import viser.transforms as vtf
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.space.partition import robust_range
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.types import View, centers_of
-from abcd_ns.viewer.status import Status
+from abcd_ns.viewer.texts import Status
 
 SCENE_SCALE = 10.0
 """Units of nerfstudio's viewer in a world unit."""
-BULK = 0.95
-"""Share of the points, on each axis, that the outermost boxes reach to."""
-MARGIN = 0.05
-"""By how much they reach farther, as a share of that extent."""
+MARGIN = 0.1
+"""Of the outermost boxes beyond 90% of the points on each axis, as a share of these."""
 GAP = 0.004
 """Between the boxes of neighbours, as a share of the bulk's diagonal: faces that coincide would flicker."""
-MOST_POINTS = 100_000
-"""Of which the bulk is found."""
-
 _PATH = (0, 4, 6, 2, 0, 1, 5, 4, 5, 7, 6, 7, 3, 2, 3, 1)
 """Corners in an order that follows all edges of a box; their bits say which are upper, x first."""
 COLORS = {
@@ -101,12 +97,8 @@ class Scenery:
 
 
 def bulk(means: Float[Tensor, "n 3"]) -> Box:
-    """The box that holds the bulk of the points; a unit cube if there are none."""
-    points = means[torch.isfinite(means).all(dim=1)].double().cpu()
-    points = points[:: max(len(points) // MOST_POINTS, 1)]
-    if len(points) == 0:
-        return Box(torch.zeros(3).double() - 0.5, torch.zeros(3).double() + 0.5)
-    low, high = torch.quantile(points, torch.tensor([(1 - BULK) / 2, (1 + BULK) / 2]).double(), dim=0)
+    """The box that holds the bulk of the points; outliers do not stretch it."""
+    low, high = robust_range(means[torch.isfinite(means).all(dim=1)].cpu())
     margin = (MARGIN * (high - low)).clamp_min(1e-3)
     return Box(low - margin, high + margin)
 

@@ -18,7 +18,7 @@ from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Show
 from abcd_ns.viewer.scenery import COLORS
-from abcd_ns.viewer.status import Status
+from abcd_ns.viewer.texts import Status
 from tests.nerfstudio.test_training import configure, run
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 from websockets.datastructures import Headers
 
-from abcd_ns.viewer.guard import rules as rules_module
-from abcd_ns.viewer.guard.rules import Rules, content_policy, plain_path
+from abcd_ns.viewer import guard
+from abcd_ns.viewer.guard import Rules, content_policy, plain_path
 from tests.viewer.client import CAMERA
 
 
@@ -46,15 +46,15 @@ def test_what_was_configured_is_known(rules, known, strange):
 
 
 def test_a_viewer_on_all_networks_goes_by_addresses_and_own_names_alone(monkeypatch):
-    monkeypatch.setattr(rules_module.socket, "gethostname", lambda: "Lab7.local")
-    monkeypatch.setattr(rules_module.socket, "getfqdn", lambda: "lab7.example.org")
-    rules_module._own_names.cache_clear()
+    monkeypatch.setattr(guard.socket, "gethostname", lambda: "Lab7.local")
+    monkeypatch.setattr(guard.socket, "getfqdn", lambda: "lab7.example.org")
+    guard._own_names.cache_clear()
     known = ["192.168.1.5:7007", "[fe80::1]:7007", "lab7:7007", "lab7.example.org", "lab7.local", "localhost"]
     assert [host for host in known if not EVERYWHERE.knows(host)] == []
     assert not EVERYWHERE.knows("rebound.evil.example:7007")
     assert Rules("lab7").knows("lab7.example.org:7007")
     assert not HOME.knows("lab7.example.org:7007")  # a stranger's network may have given us this name
-    rules_module._own_names.cache_clear()
+    guard._own_names.cache_clear()
 
 
 def test_the_origin_must_be_the_viewers_own():

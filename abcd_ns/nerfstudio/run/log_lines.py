@@ -1,4 +1,4 @@
-"""The lines of a run's log: what each kind of them says; some are an event of the engine's."""
+"""The lines of a run's log by kind; some are an event of the engine's."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ SCHEMA = 2
 
 @dataclass(frozen=True)
 class Line:
-    """What all lines say."""
+    """What all lines have."""
 
     step: int
-    """Optimisation steps taken by then."""
+    """Optimisation steps so far."""
     seconds: float
-    """Of training by then."""
+    """Of training so far."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class TrainingLine(Line):
     limit: int | None
     """On the number of Gaussians in the scene."""
     budgets: dict[str, int]
-    """Limits of what is kept at hand, bytes, by name."""
+    """Limits of what is kept in memory, bytes, by name."""
     compiled_loss: bool = False
     """Whether the loss runs in Triton's kernels."""
 
@@ -41,18 +41,18 @@ class VisitLine(VisitBegan, Line):
 
 @dataclass(frozen=True)
 class SampleLine(Line):
-    """How things stand; written every now and then."""
+    """Where the run stands, every now and then."""
 
     psnr: float | None
-    """Mean over the steps since the last sample, of the crops that were trained on, dB."""
+    """Mean of training crops since the last sample, dB."""
     gaussians: int
     """In the whole scene."""
     rss_bytes: int
     """RAM of the process."""
     device_bytes: int | None
-    """That torch has given out on the CUDA device; None without one."""
+    """Of torch on the CUDA device; None without one."""
     held: dict[str, int]
-    """Of each budget, what is in use, bytes."""
+    """Bytes in use of each budget."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class VisitEndLine(Line):
     layer_seconds: float
     visit_seconds: float
     psnr: float | None
-    """Mean over the visit's later half, of the crops that were trained on, dB."""
+    """Mean of training crops in the visit's later half, dB."""
 
 
 def layer_share(visits: Iterable[VisitEndLine]) -> float:
-    """Share of the visits' time that went into layers, 0..1: one number for terminal, log and report."""
+    """Share of the visits' time that went into layers, 0..1."""
     visits = list(visits)
     return sum(visit.layer_seconds for visit in visits) / max(sum(v.visit_seconds for v in visits), 1e-9)
 
@@ -85,12 +85,12 @@ class EpochEndLine(EpochEnded, Line):
 
 @dataclass(frozen=True)
 class PrunedAtEndLine(PrunedAtEnd, Line):
-    """The run was complete, and what its pictures hardly miss was taken out."""
+    """The final pruning is over."""
 
 
 @dataclass(frozen=True)
 class WorkerLostLine(WorkerLost, Line):
-    """A worker was lost, and the visit it was at is trained again."""
+    """A worker was lost, and its visit is trained again."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class WorkerLine(Line):
 
 @dataclass(frozen=True)
 class HeldOutLine(Line):
-    """The held-out views were looked at; means over them."""
+    """Means over the held-out views."""
 
     psnr: float | None
     """dB; None where it is not finite."""
@@ -141,4 +141,4 @@ KIND_OF = {
     WorkerLost: "worker lost",
     PrunedAtEnd: "pruned at end",
 }
-"""By what of the engine's events is a line as it is."""
+"""Events of the engine that are lines."""

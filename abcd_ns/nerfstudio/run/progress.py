@@ -10,86 +10,69 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.live import Live
 from rich.text import Text
 
-from abcd_ns.engine.events import (
-    EpochEnded,
-    Event,
-    HeldOutScored,
-    LayersDrawn,
-    PrunedAtEnd,
-    Pruning,
-    Repaired,
-    StepTaken,
-    VisitBegan,
-    WorkerLost,
-    WorkerSeen,
-    WorkersSeen,
-)
+from abcd_ns.data.input_errors import say
+from abcd_ns.engine import events
 from abcd_ns.engine.train.health_record import REPAIRED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words
-from abcd_ns.viewer.status import time_left
-from abcd_ns.viewer.texts import clock
+from abcd_ns.viewer.texts import clock, time_left
 
 SECONDS_BETWEEN_LINES = 10.0
-"""Where the output is no terminal (a log file, say), a line is printed this often."""
+"""Where the output is no terminal, such as a log file."""
 SECONDS_BETWEEN_LOOKS = 0.1
-"""On a terminal no line is made more often: a step may be shorter, and memory takes asking."""
+"""On a terminal."""
 SMOOTHING = 0.98
-"""Of the PSNR shown: the weight of what was there before."""
-
+"""Weight of the PSNR that was shown before."""
 ALARMING = ("gradients", "moments", "values")
-"""What is said at once when it is repaired; the rest is counted and said at the end."""
+"""Repairs that are printed at once; the others are counted for the end."""
 
 
 class ProgressReport:
     """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds.
 
     Args:
-        visits: those that ended so far, of the whole run; the log goes on adding to them.
+        visits: those that ended, of the whole run; the log adds to them.
     """
 
     def __init__(self, coordinator: Trainer, visits: Sequence[VisitEndLine] = ()) -> None:
         self._coordinator, self._visits = coordinator, visits
-        self._held_out: HeldOutScored | None = None
+        self._held_out: events.HeldOutScored | None = None
         self._psnr: float | None = None
-        self._visit: VisitBegan | None = None
-        self._workers: tuple[WorkerSeen, ...] = ()
-        self._last_line = self._last_look = time.monotonic()
+        self._visit: events.VisitBegan | None = None
+        self._workers: tuple[events.WorkerSeen, ...] = ()
+        self._shown = time.monotonic()
         self._live: Live | None = None
 
-    def __call__(self, event: Event) -> None:
+    def __call__(self, event: events.Event) -> None:
         """Take note of an event."""
         match event:
-            case VisitBegan():
+            case events.VisitBegan():
                 self._visit = event
                 self._show("")
-            case LayersDrawn():
+            case events.LayersDrawn():
                 self._show(f"layers {event.done}/{event.total}")
-            case StepTaken():
+            case events.StepTaken():
                 self._take_step(event)
-            case EpochEnded() if self._coordinator.scene.tree.num_blocks > 1:
+            case events.EpochEnded() if self._coordinator.scene.tree.num_blocks > 1:
                 self._print(f"epoch {event.epoch} done at step {event.step:,}: {self._summary()}")
-            case HeldOutScored():
+            case events.HeldOutScored():
                 self._held_out = event
-            case Pruning():
+            case events.Pruning():
                 self._show(f"final pruning {event.done}/{event.total}", event.done / event.total)
-            case PrunedAtEnd():
+            case events.PrunedAtEnd():
                 self._print(_pruned(event))
-            case WorkersSeen():
+            case events.WorkersSeen():
                 self._workers = event.workers
                 self._show("")
-            case WorkerLost():
+            case events.WorkerLost():
                 self._print(f"{_block(event.block)}: lost its worker, trained again: {event.why}")
-            case Repaired() if event.what in ALARMING:
+            case events.Repaired() if event.what in ALARMING:
                 self._print(f"{_block(event.block)}: {event.count:,} {REPAIRED[event.what]}")
 
     def scalars(self) -> dict[str, float]:
-        """Where the training stands, by name, for TensorBoard, wandb and comet.
-
-        Blocks count from 1; 0 is the warm-up, or a method that has no visits.
-        """
+        """Where the training stands, for TensorBoard, wandb and comet; block 0 is the warm-up or no visit."""
         coordinator, block = self._coordinator, None if self._visit is None else self._visit.block
         found = {
             "block": 0 if block is None else block + 1,
@@ -104,26 +87,22 @@ class ProgressReport:
         return found
 
     def close(self) -> None:
-        """Take the live line away and say what became of the run."""
+        """Replace the live line by a summary of the run."""
         if self._live is not None:
             self._live.stop()
             self._live = None
         state = self._coordinator.state
         visits = "1 visit" if state.visit == 1 else f"{state.visit} visits"
-        CONSOLE.print(
-            f"Trained {state.step:,} steps in {visits}, "
-            f"{clock(self._coordinator.stopwatch.seconds)}: {self._summary()}.",
-            highlight=False,
-            soft_wrap=True,
-        )
+        seconds = clock(self._coordinator.stopwatch.seconds)
+        say(f"Trained {state.step:,} steps in {visits}, {seconds}: {self._summary()}.")
         lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
         wanted, degree = self._coordinator.config.sh_degree, state.sh_degree
         if self._coordinator.config.limits.late_harmonics and degree < wanted:
             lines.append(f"harmonics up to degree {degree} of {wanted}: others had no room, or no time")
         for line in lines if state.health else []:  # exact joint training has no visits
-            CONSOLE.print(f"  {line}", highlight=False)
+            say(f"  {line}")
 
-    def _take_step(self, event: StepTaken) -> None:
+    def _take_step(self, event: events.StepTaken) -> None:
         self._held_out = None  # of an earlier step
         if math.isfinite(event.psnr):
             before = event.psnr if self._psnr is None else self._psnr
@@ -144,23 +123,28 @@ class ProgressReport:
         return f"{quality}, {self._coordinator.count():,} Gaussians, {share:.0%} of the time for layers"
 
     def _show(self, what: str, pruned: float | None = None) -> None:
-        now = time.monotonic()
-        if CONSOLE.is_terminal:
-            if now - self._last_look >= SECONDS_BETWEEN_LOOKS:
-                self._last_look = now
-                if self._live is None:
-                    self._live = Live(console=CONSOLE, transient=True)
-                    self._live.start()
-                self._live.update(Text(fitting(self._parts(what, pruned), CONSOLE.width - 1)))
-        elif now - self._last_line > SECONDS_BETWEEN_LINES:
-            self._print(f"  {'  '.join(self._parts(what, pruned))}")
+        """Show what is done on a line; `pruned` is the share of the final pruning that is done."""
+        least = SECONDS_BETWEEN_LOOKS if CONSOLE.is_terminal else SECONDS_BETWEEN_LINES
+        if time.monotonic() - self._shown < least:
+            return
+        parts = self._parts(what, pruned)
+        if not CONSOLE.is_terminal:
+            self._print(f"  {'  '.join(parts)}")
+            return
+        self._shown = time.monotonic()
+        if self._live is None:
+            self._live = Live(console=CONSOLE, transient=True)
+            self._live.start()
+        while len(parts) > 2 and len("  ".join(parts)) >= CONSOLE.width:
+            parts.pop()
+        self._live.update(Text("  ".join(parts)[: CONSOLE.width - 1]))
 
     def _print(self, line: str) -> None:
-        self._last_line = time.monotonic()
-        CONSOLE.print(line, highlight=False, soft_wrap=True)
+        self._shown = time.monotonic()
+        say(line)
 
     def _parts(self, what: str, pruned: float | None) -> list[str]:
-        """Of the line, the most important first; `pruned` is the share of the final pruning that is done."""
+        """Parts of the line, the most important first."""
         coordinator, visit = self._coordinator, self._visit
         if pruned is not None:
             where = ""
@@ -183,15 +167,7 @@ class ProgressReport:
         return [part for part in parts if part]
 
 
-def fitting(parts: Sequence[str], width: int) -> str:
-    """As many parts as fit into a line of a terminal, the first two at least."""
-    shown = list(parts)
-    while len(shown) > 2 and len("  ".join(shown)) > width:
-        shown.pop()
-    return "  ".join(shown)[:width]
-
-
-def _pruned(event: PrunedAtEnd) -> str:
+def _pruned(event: events.PrunedAtEnd) -> str:
     before, cost = event.gaussians + event.gone, event.before - event.after
     said = f"Pruned {event.gone:,} of {before:,} Gaussians"
     return f"{said} (costs {cost:.2f} dB on {event.views} training views)." if event.gone else f"{said}."
@@ -201,8 +177,7 @@ def _block(block: int | None) -> str:
     return "warm-up" if block is None else f"block {block + 1}"
 
 
-def _at_work(workers: Sequence[WorkerSeen]) -> str:
-    """What workers are doing, in few words."""
+def _at_work(workers: Sequence[events.WorkerSeen]) -> str:
     busy = [str(worker.block + 1) for worker in workers if worker.block is not None]
     which = f": blocks {', '.join(busy[:4])}{', ...' if len(busy) > 4 else ''}" if busy else ""
     return f"{len(busy)} of {len(workers)} workers busy{which}"

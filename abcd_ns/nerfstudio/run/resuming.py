@@ -13,13 +13,12 @@ from abcd_ns.run.store import ASKED, Start
 
 
 def find_start(config: TrainerConfig) -> Start | None:
-    """What --load-dir, --load-step and --load-checkpoint ask for; None begins anew.
+    """What --load-dir, --load-step and --load-checkpoint name; None begins anew.
 
-    `--load-dir` alone is the newest that the run has: its last visit's end, or its last checkpoint where that
-    is newer. It may name the run's folder or `nerfstudio_models` in it, with or without checkpoints there.
+    `--load-dir` alone takes the newest state of the run. It names its folder or `nerfstudio_models` in it.
 
     Raises:
-        UserError: there is nothing to go on from, or the options name two things.
+        UserError: there is nothing to resume, or the options name two things.
     """
     if config.load_checkpoint is not None:
         if config.load_dir is not None or config.load_step is not None:
@@ -42,20 +41,20 @@ def find_start(config: TrainerConfig) -> Start | None:
 
 
 def pin_name(step: int) -> str:
-    """The store's pin that belongs to a checkpoint: its file name without the ending."""
+    """The store's pin of a checkpoint: its file name without the ending."""
     return f"step-{step:09d}"
 
 
 def check_start(start: Start | None, folder: Path, asked: int) -> None:
-    """Check what a run resumes from before it writes anything.
+    """Check what a run resumes before it writes anything.
 
     Args:
         folder: for its store.
         asked: `--pipeline.blocks`; 0 accepts any number.
 
     Raises:
-        UserError: `folder` holds another run's store or is being written to; or the run resumed from was
-            begun with another number of blocks.
+        UserError: `folder` holds another run's store or is being written to; or the resumed run has another
+            number of blocks.
     """
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):
@@ -73,7 +72,7 @@ def check_start(start: Start | None, folder: Path, asked: int) -> None:
 
 
 def has_begun(folder: Path) -> bool:
-    """Whether a run has put anything into its store in `folder`, so that it can be gone on with."""
+    """Whether the store in `folder` holds anything, so that its run can be resumed."""
     try:
         return bool(ParameterStore.open(folder, read_only=True).blocks)
     except StoreError:

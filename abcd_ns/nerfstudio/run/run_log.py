@@ -14,18 +14,7 @@ import torch
 
 from abcd_ns.data.input_errors import say
 from abcd_ns.data.photos import Photos
-from abcd_ns.engine.events import (
-    EpochEnded,
-    Event,
-    HeldOutScored,
-    PrunedAtEnd,
-    StepTaken,
-    VisitBegan,
-    VisitEnded,
-    WorkerLost,
-    WorkerSeen,
-    WorkersSeen,
-)
+from abcd_ns.engine import events
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
@@ -36,21 +25,19 @@ from abcd_ns.run.store import Start
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
 SAMPLES = 300
-"""Later samples are a longer time apart, this share of what has passed: a day's log is hardly longer than an
+"""Later samples are farther apart, by 1 / SAMPLES of the time so far: a day's log is hardly longer than an
 hour's."""
 LINES_KEPT = 64
-"""Lines wait in memory for the end of a visit, but no more than so many."""
+"""Lines that wait in memory for the end of a visit, at most."""
 
 
 class RunLog:
-    """Listens to a coordinator and writes down what it says.
-
-    The log is a by-product: if the disk refuses it, that is said once, and the training goes on.
+    """Listens to a coordinator and writes its events down. If the disk refuses, it says so once and ends.
 
     Args:
         path: of the log; its folder must exist.
-        meters: of what is kept at hand, by name: what tells the bytes in use, and their limit.
-        earlier: the log of the run that this one goes on from, as far as that is its past; may be the same.
+        meters: of what is kept in memory, by name: a function for the bytes in use, and their limit.
+        earlier: the log of the run that is resumed; may be the same.
     """
 
     def __init__(
@@ -69,7 +56,7 @@ class RunLog:
         self._psnrs: list[float] = []
         self._visit_psnrs: dict[int, list[float]] = {}
         self._lines: list[str] = []
-        self._workers: tuple[WorkerSeen, ...] = ()
+        self._workers: tuple[events.WorkerSeen, ...] = ()
         if earlier is not None:
             past = past_of(coordinator, earlier)
             with suppress(TypeError, KeyError):  # of another version
@@ -83,37 +70,33 @@ class RunLog:
         self._note("training", schema=SCHEMA, **scene, budgets=budgets, compiled_loss=fused.photometric.runs)
         self._flush()
 
-    def __call__(self, event: Event) -> None:
+    def __call__(self, event: events.Event) -> None:
         """Take note of an event."""
         match event:
-            case StepTaken():
+            case events.StepTaken():
                 self._take_step(event)
-            case VisitEnded():
+            case events.VisitEnded():
                 self._end_visit(event)
-            case WorkersSeen():
+            case events.WorkersSeen():
                 self._workers = event.workers
-            case VisitBegan() | EpochEnded() | WorkerLost() | PrunedAtEnd():
-                self._note(KIND_OF[type(event)], **vars(event))
-                self._flush()
-            case HeldOutScored():
+            case events.HeldOutScored():
                 self._note("held out", psnr=_finite(event.psnr), ssim=_finite(event.ssim))
+                self._flush()
+            case _ if type(event) in KIND_OF:
+                self._note(KIND_OF[type(event)], **vars(event))
                 self._flush()
 
     def close(self) -> None:
-        """Training is over: say what it took."""
+        """Write what the training took."""
         self._sample()
         for worker in self._workers:
             told = {name: getattr(worker, name) for name in ("worker", "visits", "deaths")}
             self._note("worker", **told, waited=round(worker.waited, 3))
-        self._note(
-            "end",
-            gaussians=self._coordinator.count(),
-            peak_rss_bytes=peak_rss_bytes(),
-            peak_device_bytes=peak_device_bytes()[0],
-        )
+        peaks = {"peak_rss_bytes": peak_rss_bytes(), "peak_device_bytes": peak_device_bytes()[0]}
+        self._note("end", gaussians=self._coordinator.count(), **peaks)
         self._flush()
 
-    def _take_step(self, event: StepTaken) -> None:
+    def _take_step(self, event: events.StepTaken) -> None:
         if math.isfinite(event.psnr):
             self._psnrs.append(event.psnr)
             self._visit_psnrs.setdefault(event.visit, []).append(event.psnr)
@@ -121,13 +104,12 @@ class RunLog:
         if seconds - self._sampled >= max(SECONDS_BETWEEN_SAMPLES, seconds / SAMPLES):
             self._sample()
 
-    def _end_visit(self, event: VisitEnded) -> None:
+    def _end_visit(self, event: events.VisitEnded) -> None:
         self._sample()
         psnrs = self._visit_psnrs.pop(event.visit, [])
         told = vars(event) | {"layer_seconds": round(event.layer_seconds, 3)}
         seconds = round(told.pop("seconds"), 3)  # a line's own are of the whole run
-        fields = {**told, "visit_seconds": seconds, "psnr": _mean(psnrs[len(psnrs) // 2 :])}
-        self._note("visit end", **fields)
+        self._note("visit end", **told, visit_seconds=seconds, psnr=_mean(psnrs[len(psnrs) // 2 :]))
         self._flush()
 
     def _sample(self) -> None:
@@ -176,10 +158,7 @@ class RunLog:
 
 
 def past_of(coordinator: Trainer, log: Path) -> list[str]:
-    """The lines of an earlier run's log that are the past of a run that was resumed from it.
-
-    What it did after its checkpoint is cut. A line that cannot be read ends the past.
-    """
+    """The lines of a log up to where a run was resumed from it, or up to a line that cannot be read."""
     state, kept = coordinator.state, []
     with suppress(OSError, ValueError, KeyError, TypeError):
         for text in log.read_bytes().decode("utf-8", "replace").splitlines():
@@ -187,7 +166,7 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
             # A visit that began after the checkpoint begins once more, at the same step.
             again = line["kind"] == "visit" and line["visit"] >= state.visit
             if line["step"] <= state.step and line["kind"] not in ("end", "worker") and not again:
-                # The clock goes on from the commit, and what was said of it came after.
+                # The clock goes on from the commit; the line may have come after it.
                 line["seconds"] = min(line["seconds"], round(coordinator.stopwatch.seconds, 3))
                 kept.append(json.dumps(line))
     return kept

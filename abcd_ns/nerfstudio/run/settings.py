@@ -1,7 +1,6 @@
-"""What a run was trained with, in `abcd/settings.json`: plain values that are read without trusting anyone.
+"""What a run was trained with, in `abcd/settings.json`: plain values, safe to read.
 
-nerfstudio's config.yml names Python objects, which its loader makes: its author decides what is
-run. A report about a run from elsewhere must not do that.
+nerfstudio's config.yml names Python objects, and loading it runs what its author chose.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ class Settings:
     data: str
     """The folder, as it was given."""
     data_path: str
-    """The same as an absolute path."""
+    """Its absolute path."""
     begun: datetime
     """When training began: UTC."""
     options: dict[str, Plain]
@@ -51,10 +50,7 @@ class Settings:
 
 
 def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Path) -> None:
-    """Write `folder`/settings.json about a training that is about to begin; the folder must exist.
-
-    Args:
-        options: as they were asked for.
+    """Write `folder`/settings.json with these options; the folder must exist.
 
     Raises:
         UserError: the disk refused.
@@ -73,7 +69,7 @@ def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Pat
         machine=describe_machine(),
         reader=reader_name(config.pipeline.datamanager.dataparser),
     )
-    plain = msgspec.to_builtins(settings, enc_hook=str)  # torch's version is a string of its own
+    plain = msgspec.to_builtins(settings, enc_hook=str)  # torch's version is no plain string
     content = json.dumps(plain, indent=2, allow_nan=False)
     try:
         write_file(folder / SETTINGS_FILE, (content + "\n").encode())
