@@ -150,7 +150,7 @@ class AbcdTrainerConfig(TrainerConfig):
                 points = splats or (0 if model.random_init else found.points) or model.num_random
                 device = torch.device(self.machine.device_type)
                 budget = device_budget(pipeline.device_budget_gb, device)
-                fit_run(pipeline, budget, found.pixels, found.factor, points, device)
+                fit_run(pipeline, budget, found.pixels, found.factor, points, device.type == "cpu")
 
 
 class AbcdTrainer(Trainer):

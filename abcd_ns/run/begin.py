@@ -109,17 +109,16 @@ def begin_run(
         start: what it resumes; None for a new run.
 
     Raises:
-        UserError: nothing fits on the device; `folder` holds another run's store; or `start` was made for
-            something else.
+        UserError: nothing fits on the device, or `start` was made for something else.
     """
     device_bytes = fit.device_budget(options.device_budget_gb, device)
     rasterizer.warm_up()
     loss.warm_up(device)
-    training = options.training
+    training, on_cpu = options.training, device.type == "cpu"
     made_for = MadeFor.of(capture.photos, capture.views, training)
     with ExitStack() as undo:
         if start is None:
-            store = _new_store(folder, options, capture, device, device_bytes, made_for, say)
+            store = _new_store(folder, options, capture, device_bytes, on_cpu, made_for, say)
         else:
             store = take_over(start, folder, made_for)
         undo.callback(store.close)
@@ -129,10 +128,8 @@ def begin_run(
         if start is not None and options.blocks == 0 and options.device_budget_gb > 0:
             # It resumes with a budget of its own; else it keeps the limits that it began with.
             there, blocks = sum(map(store.counts, range(tree.num_blocks))), tree.num_blocks
-            allowed = fit.fit_run(
-                options, device_bytes, capture.pixels, capture.factor, there, device, blocks
-            )
-            fitted |= allowed.limits
+            photos = capture.pixels, capture.factor
+            fitted |= fit.fit_run(options, device_bytes, *photos, there, on_cpu, blocks).limits
         training = replace(training, limits=replace(training.limits, **fitted))
         if start is not None:
             cut_stored(scene, RunState.from_json(store.state), training.limits)
@@ -143,9 +140,6 @@ def begin_run(
             trainer.restore()
         undo.pop_all()
     return trainer
-
-
-# -- what trains it ------------------------------------------------------------------------------------
 
 
 def _trainer_of(
@@ -172,15 +166,12 @@ def _trainer_of(
     return Dispatcher(run, remote(setup, count, device_bytes), None, room, target)
 
 
-# -- the store -----------------------------------------------------------------------------------------
-
-
 def _new_store(
     folder: Path,
     options: RunOptions,
     capture: Capture,
-    device: torch.device,
     device_bytes: int,
+    on_cpu: bool,
     made_for: MadeFor,
     say: Say,
 ) -> ParameterStore:
@@ -189,7 +180,7 @@ def _new_store(
     cloud = _first_cloud(capture, training, say)
     blocks, fitted = options.blocks, {name: getattr(training.limits, name) for name in FITTED}
     if blocks == 0:
-        allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), device)
+        allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), on_cpu)
         say(allowed.in_words())
         workers = options.workers if fit.has_workers(options) else 0
         blocks, fitted = fit.blocks_to_begin_with(allowed, workers), allowed.limits
@@ -204,7 +195,7 @@ def _new_store(
         content = independent_blocks(tree, cloud)
     else:
         content = stored_blocks(tree, cloud, room=keep, seed=training.seed)
-    del cloud  # it goes as soon as it is parted
+    del cloud  # frees it while blocks are written
     store.commit(content)
     return store
 

@@ -36,9 +36,8 @@ PICTURE_SHARE = 0.75
 LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
-"""The limits that follow from the device's memory; a run keeps them."""
 COARSE_MODEL = "coarse_gaussians"
-"""Another, of the warm-up's memory."""
+"""The limits that follow from the device's memory; a run keeps them."""
 MOST_DOWNSCALE = 64
 """No larger factor is proposed."""
 BLOCKS_EACH = 2
@@ -95,11 +94,11 @@ class Fit:
         return said
 
 
-def device_budget(wanted_gb: float, device: torch.device | str) -> int:
+def device_budget(wanted_gb: float, device: torch.device) -> int:
     """Bytes of the device that training may take; a wanted 0 takes a share of what is free."""
     if wanted_gb > 0:
         return int(wanted_gb * GIB)
-    if (device := torch.device(device)).type == "cuda":
+    if device.type == "cuda":
         return int(FREE_SHARE * free_on_gpu(device))
     return int(RAM_SHARE * psutil.virtual_memory().total)
 
@@ -162,21 +161,15 @@ class Demand:
 
 
 def fit_run(
-    options: RunOptions,
-    budget: int,
-    pixels: int,
-    factor: int,
-    gaussians: int,
-    device: torch.device,
-    blocks: int = 1,
+    options: RunOptions, budget: int, pixels: int, factor: int, gaussians: int, on_cpu: bool, blocks: int = 1
 ) -> Fit:
-    """What a run's options allow, on a device that has `budget` bytes for it; the rest is Demand's.
+    """What a run's options allow within `budget` bytes of the device; see Demand for the others.
 
     Raises:
         UserError: there is no room for any block worth a visit; says what would help.
     """
     training, room = options.training, options.gaussian_bytes
-    demand = Demand(pixels, gaussians, training, training.density.limit, factor, blocks, device.type == "cpu")
+    demand = Demand(pixels, gaussians, training, training.density.limit, factor, blocks, on_cpu)
     if not room:
         return find_fit(budget, demand)
     if (fit := _best(_fit_gaussians(room, each) for each in demand.with_fewer_harmonics())) is None:
@@ -317,13 +310,13 @@ def works_at_once(recipe: Recipe) -> bool:
     return not recipe.exact and recipe.overlap == 0
 
 
-def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device | str) -> int:
+def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device) -> int:
     """`RunOptions.workers`, its 0 resolved for a scene of that many blocks."""
     if asked:
         return asked
     # Workers learn nothing of light and poses: two of them may show one photo.
     learns = training.light != "none" or training.poses != "off"
-    if learns or not works_at_once(training.recipe) or not can_fork(torch.device(device)):
+    if learns or not works_at_once(training.recipe) or not can_fork(device):
         return 1
     return max(min(threads_wanted(), blocks // BLOCKS_EACH), 1)
 

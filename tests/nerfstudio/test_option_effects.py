@@ -17,7 +17,7 @@ from tests.data.dataparser_scenes import NAMES, write_capture, write_model, writ
 from tests.engine.train.test_option_effects import NOT_LEARNT, OTHERS, OTHERS_OF_DENSITY
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_options import refused
-from tests.nerfstudio.test_training import configure, run
+from tests.nerfstudio.test_training import configure, run, set_option
 
 GROUPS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 LEARNT = {
@@ -78,13 +78,6 @@ OF_NERFSTUDIO = {
     *(f"optimizers.{group}.optimizer.eps" for group in GROUPS),  # torch's; 1e-15 is far below any gradient
 }  # fmt: skip
 """Read by nerfstudio's loggers, loop and viewer, or by Adam."""
-
-
-def set_option(config, name: str, value: object) -> None:
-    holder, *names = config, *name.split(".")
-    for part in names[:-1]:
-        holder = holder[part] if isinstance(holder, dict) else getattr(holder, part)
-    setattr(holder, names[-1], value)
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,7 @@ from abcd_ns.nerfstudio.options import (
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.run.begin import grid_counts
 from tests.nerfstudio.forks import forget, in_a_fork
+from tests.nerfstudio.test_training import set_option
 
 METHODS = {
     found.config.method_name: found.config
@@ -185,10 +186,7 @@ BELOW_0 = ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "dataman
 def test_what_has_no_effect_or_cannot_be_is_refused_from_files_too(way, value, says):
     config = copy.deepcopy(METHODS["abcd"])
     check_options(config)
-    holder, *names = config, *way.split(".")
-    for name in names[:-1]:
-        holder = holder[name] if isinstance(holder, dict) else getattr(holder, name)
-    setattr(holder, names[-1], value)
+    set_option(config, way, value)
     with pytest.raises(UserError) as refused:
         check_options(config)
     assert says in str(refused.value)

@@ -17,7 +17,7 @@ from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
 from abcd_ns.run.store import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
-from tests.nerfstudio.test_training import STEPS, configure, run
+from tests.nerfstudio.test_training import STEPS, configure, run, set_option
 from tests.reference.crash_runs import Kill
 from tests.reference.scenes import ring_of_views
 
@@ -279,20 +279,20 @@ def test_a_damaged_store_is_named(data, stopped, tmp_path, capsys):
     assert "is damaged: its checksum is wrong. Go back to a pinned generation" in said
 
 
-def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stopped, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("max_num_iterations", 2, "give --max-num-iterations above that"),
+        ("pipeline.blocks", 5, "was begun with --pipeline.blocks 3, not 5"),
+        ("pipeline.training.sh_degree", 1, "it was made for sh degree 3, not 1"),
+    ],
+)
+def test_other_options_than_the_stores_are_refused_and_both_are_shown(
+    data, stopped, tmp_path, capsys, name, value, said
+):
     config = configure(data, tmp_path / "b", load_dir=stopped)
-    config.pipeline.training.sh_degree = 1
-    assert "it was made for sh degree 3, not 1" in refusal(config, capsys, late=True)
-
-
-def test_another_number_of_blocks_is_refused(data, stopped, tmp_path, capsys):
-    said = refusal(configure(data, tmp_path / "b", blocks=5, load_dir=stopped), capsys)
-    assert "was begun with --pipeline.blocks 3, not 5" in said
-
-
-def test_fewer_steps_than_there_were_are_refused(data, stopped, tmp_path, capsys):
-    said = refusal(configure(data, tmp_path / "b", load_dir=stopped, steps=2), capsys)
-    assert "give --max-num-iterations above that" in said
+    set_option(config, name, value)
+    assert said in refusal(config, capsys, late="training" in name)
 
 
 def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):

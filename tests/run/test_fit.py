@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import (
-    DeviceNeeds,
-    coarse_model_size,
-    degree_with_room,
-    levels_of,
-    limits_at,
-)
+from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, degree_with_room, levels_of, limits_at
 from abcd_ns.errors import UserError
 from abcd_ns.run.fit import FEW, LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
@@ -165,37 +159,27 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
     assert size > block
 
 
-def test_the_warm_up_has_the_size_that_is_asked_for():
-    assert coarse_model_size(training_config(coarse_gaussians=500), 3_333, PIXELS) == 500
+@pytest.mark.parametrize(
+    ("fitted", "size"),
+    [({"coarse_gaussians": 500}, 500), ({"batch": 1}, 3_333), ({"batch": 1, "crop_pixels": 900}, 3_333)],
+)
+def test_the_warm_up_has_the_size_that_is_asked_for_and_with_one_view_in_a_step_a_blocks(fitted, size):
+    assert coarse_model_size(training_config(**fitted), 3_333, PIXELS) == size
 
 
-@pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch": 1, "crop_pixels": 900}])
-def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block(fitted):
-    assert coarse_model_size(training_config(**fitted), 3_333, PIXELS) == 3_333
-
-
-def test_a_scene_that_fits_is_one_block():
-    def fit(points, most=None):
-        return fit_for(24, PIXELS, points, most)
-
-    assert fit(2_000_000).blocks == 1
-    assert fit(200_000_000).blocks > 10
-    # What it may become is no reason to cut it now; what it may not become is none either.
-    assert fit(2_000_000, most=100_000_000).blocks == 1
-    assert fit(2_000_000, most=100_000_000).blocks_at_the_end > 10
-    assert fit(200_000_000, most=2_000_000).blocks == 1
+def test_what_a_scene_may_become_is_no_reason_to_cut_it_now():
+    grows = fit_for(24, PIXELS, 2_000_000, most=100_000_000)
+    assert (grows.blocks, grows.blocks_at_the_end > 10) == (1, True)
+    assert fit_for(24, PIXELS, 200_000_000).blocks > 10
+    assert fit_for(24, PIXELS, 200_000_000, most=2_000_000).blocks == 1
 
 
 @pytest.mark.parametrize(
-    ("gb", "pixels", "points", "options"),
-    [
-        (0.1, PIXELS, POINTS, {}),
-        (2, GARDEN, 5_000_000, {}),
-        (0.05, 10_000, 50 * LEAST_BLOCK, {}),
-    ],
+    ("gb", "pixels", "points"),
+    [(0.1, PIXELS, POINTS), (2, GARDEN, 5_000_000), (0.05, 10_000, 50 * LEAST_BLOCK)],
 )
-def test_a_refusal_names_options_that_help(gb, pixels, points, options):
-    demand = Demand(pixels, points, TrainingConfig(**options), factor=2)
+def test_a_refusal_names_options_that_help(gb, pixels, points):
+    demand = Demand(pixels, points, TRAINING, factor=2)
     with pytest.raises(UserError) as caught:
         find_fit(int(gb * GIB), demand)
     said = str(caught.value)
