@@ -128,8 +128,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     eval_dataset: AbcdDataset
 
     device_photo_bytes: int = 0
-    """For decoded training photos and masks on the device, where it is no CPU. Of others, crops are copied
-    there in each step."""
+    """For decoded training photos and masks on a GPU. Crops of others are copied there in each step."""
     scored: int | None = None
     """Number of held-out views to score; None for all."""
 

@@ -74,11 +74,7 @@ class AbcdDataParser(DataParser):
         return self.prepared().factor
 
     def prepared(self) -> Prepared:
-        """The whole scene, read and checked at the first call.
-
-        Raises:
-            InputError: the input cannot be used; all bad files are listed.
-        """
+        """The whole scene, read at the first call; an InputError lists all bad files."""
         if self._prepared is None:
             options = self.config
             if options.as_stored and options.downscale_factor is None:
@@ -119,11 +115,7 @@ class AbcdDataParser(DataParser):
 
 
 def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataParserConfig) -> list[int]:
-    """Rows of the name-sorted list of views that belong to `split`, by eval_mode and eval_interval.
-
-    Args:
-        centers: of the views' cameras.
-        split: "train", or "val" or "test" for the views held out.
+    """Rows of the name-sorted views, by their camera centers, that belong to "train", or to "val" or "test".
 
     Raises:
         InputError: eval_interval is below 2, or a split would be empty.
@@ -165,11 +157,7 @@ def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:
 
 
 def stored_cameras(prepared: Prepared, rows: list[int]) -> Cameras:
-    """The cameras [len(rows)] of the files, distortion included.
-
-    Raises:
-        InputError: photos would have to be reduced first, or have a distortion that nerfstudio does not know.
-    """
+    """The cameras [len(rows)] of the files, distortion included; an InputError if nerfstudio lacks them."""
     lenses = []
     for source, frame in ((prepared.sources[row], prepared.scene.frames[row]) for row in rows):
         if source.stored != source.reduced:

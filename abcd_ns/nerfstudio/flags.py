@@ -72,19 +72,13 @@ def opens_ours(words: Sequence[str]) -> bool:
 
 
 def as_a_command() -> AbstractContextManager:
-    """Where a command opens a run, let a UserError end the process in one line.
-
-    Python gets the exception, and so does `ns-train`, which has blocks to put on disk first.
-    """
+    """Where a command opens a run, let a UserError end the process in one line. Python gets the exception;
+    so does `ns-train`, which has blocks to put on disk first."""
     return nullcontext() if opened(sys.argv) is None else exit_on_user_error()
 
 
 def check_tool(words: Sequence[str]) -> None:
-    """Check a command on a run of ours before anything is loaded.
-
-    Raises:
-        UserError: Gaussians cannot do it, or a path is of no use.
-    """
+    """Raise a UserError if a command cannot be done with a run of ours, or a path is of no use."""
     if (config := opened(words)) is None:
         return
     tool, what = Path(words[0]).stem, "".join(words[1:2])

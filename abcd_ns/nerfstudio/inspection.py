@@ -54,11 +54,7 @@ class Inspected:
 
 
 def inspect(config: DataParserConfig) -> Inspected:
-    """Read the model, look at every photo and decode every mask.
-
-    Raises:
-        InputError: the data cannot be used.
-    """
+    """Read the model, look at every photo and decode every mask; an InputError lists what cannot be used."""
     parser = config.setup()
     with reading(config):
         read = [parser.get_dataparser_outputs(split=split) for split in ("train", "val")]
@@ -78,7 +74,7 @@ def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found
     """Number of Gaussians in the file that a run begins with; 0 without one.
 
     Raises:
-        UserError: it cannot be read, has more than the scene may have, or lies elsewhere than the points.
+        UserError: it cannot be read, has too many Gaussians, or lies elsewhere than the points.
     """
     if (path := model.init_splats) is None:
         return 0
@@ -108,11 +104,7 @@ def _check_place(path: Path, means: Float64[Tensor, "n 3"], found: Inspected) ->
 
 
 def where_data_is(data: Path | None, config: Path) -> Path | None:
-    """Where a run's data is: as its config.yml has it, seen from here or from a folder that the run lies in.
-
-    Raises:
-        UserError: nowhere.
-    """
+    """Where a run's data is: the path in its config.yml, from here or from a folder that the run lies in."""
     if data is None:
         return None
     for base in (Path(), *config.absolute().parents):

@@ -49,9 +49,8 @@ def counted(picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w 1"] | None)
 
 
 def corrected_psnr(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> float:
-    """PSNR, dB, after the picture's colours were warped to the photo's by least squares (quadratic, as in
-    RawNeRF's code), as splatfacto's `cc_psnr`: the light of the photo, which nothing else shows, is left out.
-    """
+    """Splatfacto's `cc_psnr`, dB: PSNR after the picture's colours were warped to the photo's by least
+    squares (quadratic, as in RawNeRF's code), which leaves the photo's light out."""
     from nerfstudio.model_components.lib_bilagrid import color_correct
 
     rendered, photo = rendered.cpu(), photo.cpu()  # where least squares may be short of rank: black pictures

@@ -160,11 +160,8 @@ class AbcdModel(SplatfactoModel):
         return state
 
     def load_state_dict(self, state: dict[str, Any], **kwargs: Any) -> None:
-        """As splatfacto's, but on the CPU where the scene is too large for the device.
-
-        Raises:
-            UserError: the Gaussians are not those that were saved; torch.load accepts altered bytes.
-        """
+        """As splatfacto's, but on the CPU where the scene is too large for the device. A UserError if the
+        Gaussians are not those that were saved: torch.load accepts altered bytes."""
         expected = state.get("_extra_state", {}).get("checksum")
         count = len(state["gauss_params.means"])
         self._loaded_is_too_large = count > self._most_at_once()
@@ -201,11 +198,8 @@ class AbcdModel(SplatfactoModel):
             return self._whole_outputs(self.view(camera))
 
     def view(self, camera: Cameras) -> View:
-        """The camera as the engine draws it: on the CPU, from the scene's near plane on.
-
-        Raises:
-            UserError: it is no perspective camera. The viewer, which previews such paths, gets one.
-        """
+        """The camera as the engine draws it: on the CPU, from the scene's near plane on. A UserError if it is
+        no perspective camera; the viewer, which previews paths of others, gets one."""
         if not isinstance(camera, Cameras):
             raise UserError("Gaussians are drawn by cameras, not by rays; `abcd mesh RUN` makes a mesh.")
         camera = camera.to("cpu")
@@ -237,10 +231,8 @@ class AbcdModel(SplatfactoModel):
 
     @torch.no_grad()
     def draw_merged(self, view: View) -> Raster:
-        """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
-
-        Where the device cannot hold them all, fragments are drawn node by node and fold to the same picture.
-        """
+        """All Gaussians at once, sorted by depth, as ordinary viewers draw them. Where the device cannot hold
+        them all, fragments are drawn node by node and fold to the same picture."""
         training, too_large = self._coordinator, self._loaded_is_too_large
         if training is not None:
             too_large = training.count() > min(default_pass(self.scene()), self._most_at_once())
@@ -329,10 +321,8 @@ class AbcdModel(SplatfactoModel):
     # -- loss and metrics ----------------------------------------------------------------------------
 
     def get_metrics_dict(self, outputs: Values, batch: Values) -> Values:
-        """PSNR, a batch's mean, and the number of Gaussians in the scene.
-
-        The mean squared error of each picture is left in `outputs` for the pipeline.
-        """
+        """PSNR, a batch's mean, and the number of Gaussians in the scene. Leaves the mean squared error of
+        each picture in `outputs` for the pipeline."""
         pictures, photos = self._pairs(outputs, batch)
         errors = outputs["errors"] = squared_errors(pictures, photos)
         count = len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()

@@ -124,11 +124,7 @@ NOT_BELOW_0 = (
 
 
 def check_options(config: TrainerConfig) -> None:
-    """Check a run's options.
-
-    Raises:
-        UserError: one is out of range or has no effect, or two contradict each other.
-    """
+    """Raise a UserError if an option is out of range or has no effect, or two contradict each other."""
     pipeline = config.pipeline
     for name in NOT_BELOW_0:
         value = attrgetter(name)(pipeline)
@@ -167,13 +163,10 @@ def _refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None
 
 
 def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
-    """Check that every flag is an option with an effect; tyro would name other methods' flags.
+    """Raise a UserError if a flag is no option with an effect; names the reason, or the nearest option.
 
     Args:
         words: of `ns-train`, after the method's name. Those after the name of a reader are not checked.
-
-    Raises:
-        UserError: a flag is none; names the reason, or the nearest option.
     """
     same = (name.replace("-", "_") for flags in SAME.values() for name in flags.values())
     taken = {f"pipeline.model.{name}" for name in (*same, *HONOURED)}
@@ -201,11 +194,8 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
 
 
 def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
-    """Set the model's options that nerfstudio's tools read, and take over what the user set there.
-
-    Raises:
-        UserError: an option of splatfacto was set that ABCD does not use.
-    """
+    """Set the model's options that nerfstudio's tools read, and take over what the user set there. A
+    UserError if ABCD does not use an option that was set."""
     # ns-render sets this one for all methods.
     unused = {name: why for name, why in UNUSED_OF_MODEL.items() if name != "eval_num_rays_per_chunk"}
     _refuse_changed(model, unused, "pipeline.model.")

@@ -12,12 +12,7 @@ from abcd_ns.engine.types import Layer
 
 
 class Outputs(UserDict[str, Tensor]):
-    """Outputs by name, some of which are drawn when they are first read.
-
-    Args:
-        drawn: those that are there.
-        later: draw the others.
-    """
+    """Outputs by name: some are drawn, and `later` draws the others when they are first read."""
 
     def __init__(self, drawn: Mapping[str, Tensor], later: Mapping[str, Callable[[], Tensor]]) -> None:
         # nerfstudio's viewer opens with the first name, and splits its picture with the last one.

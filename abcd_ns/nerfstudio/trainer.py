@@ -127,9 +127,7 @@ class AbcdTrainerConfig(TrainerConfig):
 
     def check(self) -> None:
         """Choose the device, and check options, folder, what is resumed and data before anything is written.
-
-        Exits with code 2 and one line for each fault that the user can repair.
-        """
+        Exits with code 2 and one line for each fault that the user can repair."""
         device = self.machine.device_type
         if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
             self.machine.device_type = "cpu"
@@ -182,8 +180,7 @@ class AbcdTrainer(Trainer):
 
     @property
     def training_state(self) -> str:
-        """Set by the viewer's buttons. nerfstudio's loop reads it again and again while the run is paused: no
-        time counts then."""
+        """Set by the viewer's buttons. No time counts while nerfstudio's loop reads "paused"."""
         if self._training_state == "paused" and threading.get_ident() == self._trains:
             self.pipeline.coordinator.pause()
         return self._training_state
@@ -322,11 +319,8 @@ class AbcdTrainer(Trainer):
             say(f"The viewer failed at step {step} ({error!r}); training goes on.")
 
     def save_checkpoint(self, step: int) -> None:
-        """Save the merged scene for nerfstudio's tools, and everything else in the store.
-
-        Raises:
-            UserError: the disk refused; the run can still be resumed.
-        """
+        """Save the merged scene for nerfstudio's tools, and everything else in the store. A UserError if the
+        disk refuses; the run can still be resumed."""
         coordinator = self.pipeline.coordinator
         coordinator.pause()
         # Steps of workers are counted here one by one, but committed visit by visit.
@@ -347,11 +341,7 @@ class AbcdTrainer(Trainer):
 
 
 def _save_atomically(state: dict[str, Any], path: Path) -> None:
-    """Put a checkpoint in place of `path`, wholly or not at all.
-
-    Raises:
-        UserError: the disk refused.
-    """
+    """Put a checkpoint in place of `path`, wholly or not at all; a UserError if the disk refuses."""
     run = path.parent.parent  # nerfstudio takes every file beside it for a checkpoint
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,11 +13,7 @@ from abcd_ns.engine.types import View
 
 
 def view_of(cameras: Cameras, row: int = 0) -> View:
-    """Camera `row` of a list of cameras, in OpenCV convention.
-
-    Raises:
-        InputError: the camera is not a perspective one.
-    """
+    """Camera `row` of a list of cameras, in OpenCV convention; an InputError if it is no perspective one."""
     if int(cameras.camera_type[row]) != CameraType.PERSPECTIVE.value:
         kind = CameraType(int(cameras.camera_type[row])).name.lower()
         raise InputError(f"Camera {row} is {kind}; Gaussians are drawn by perspective cameras: choose these.")

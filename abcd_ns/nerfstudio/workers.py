@@ -18,11 +18,7 @@ from abcd_ns.run.fit import BLOCKS_EACH, works_at_once
 
 
 def check_workers(config: TrainerConfig) -> None:
-    """Check the options of workers.
-
-    Raises:
-        UserError: workers are of no use, or cannot be had.
-    """
+    """Raise a UserError if workers are of no use, or cannot be had."""
     pipeline = config.pipeline
     workers, cluster, blocks = pipeline.workers, pipeline.cluster, pipeline.blocks
     if workers < 0:
@@ -43,7 +39,7 @@ def check_workers(config: TrainerConfig) -> None:
 
 
 def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int) -> Workers:
-    """`count` workers of a run, with a GPU each or on a cluster; `budget` is the bytes of each one's device.
+    """`count` workers with a GPU each or on a cluster, and `budget` bytes of each device.
 
     Raises:
         WorkersError: they cannot be had.
@@ -74,11 +70,7 @@ def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int)
 
 
 def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int) -> VisitWorker:
-    """In a worker's process: photos, rasterizer and options of the run.
-
-    Raises:
-        UserError: the data differs from the driver's.
-    """
+    """In a worker's process: photos, rasterizer and options of the run; a UserError if its data differs."""
     device = torch.device("cuda" if config.machine.device_type == "cuda" else "cpu")
     data = config.pipeline.datamanager.setup(device=device, test_mode="val", world_size=1, local_rank=0)
     if len(data.train_dataset) != len(setup.views):

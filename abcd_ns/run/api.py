@@ -114,11 +114,12 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     device: torch.device | str | None = None,
 ) -> Float[Tensor, "h w 3"]:
-    """A picture of a trained scene, 0..1, on the device: None for a GPU if there is one.
+    """A picture of a trained scene, 0..1, on the device.
 
     Args:
         view: any camera in the world space of the training views.
         background: colour where nothing is.
+        device: None for a GPU if there is one.
     """
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     gaussians, placed = scene.gaussians.to(device), replace(view.to("cpu"), near=scene.near)

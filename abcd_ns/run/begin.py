@@ -76,12 +76,7 @@ def cloud_of(
     views: Sequence[View],
     training: TrainingConfig,
 ) -> PointCloud:
-    """One Gaussian for each point that the views can tell apart.
-
-    Args:
-        points: world space.
-        colors: 0..255.
-    """
+    """One Gaussian for each point (world space; colors 0..255) that the views can tell apart."""
     points, colors = thin_points(points, colors, views, training.point_pixels)
     flat = training.primitive == "2dgs"
     return cloud_from_points(points.float(), colors, sh_degree=training.sh_degree, flat=flat)
@@ -227,11 +222,8 @@ def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointC
 
 
 def grid_counts(means: Float[Tensor, "n 3"], blocks: int) -> tuple[int, int, int]:
-    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all.
-
-    Raises:
-        UserError: these would be over MAX_BLOCKS.
-    """
+    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all. A
+    UserError if these are over MAX_BLOCKS."""
     low, high = robust_range(means.cpu())
     extent = (high - low).clamp_min(1e-9).tolist()
     counts = [1, 1, 1]

@@ -163,11 +163,7 @@ class Demand:
 def fit_run(
     options: RunOptions, budget: int, pixels: int, factor: int, gaussians: int, on_cpu: bool, blocks: int = 1
 ) -> Fit:
-    """What a run's options allow within `budget` bytes of the device; see Demand for the others.
-
-    Raises:
-        UserError: there is no room for any block worth a visit; says what would help.
-    """
+    """What a run's options allow within `budget` bytes; see Demand for the others, find_fit for errors."""
     training, room = options.training, options.gaussian_bytes
     demand = Demand(pixels, gaussians, training, training.density.limit, factor, blocks, on_cpu)
     if not room:
@@ -292,11 +288,8 @@ def has_workers(options: RunOptions) -> bool:
 
 
 def blocks_to_begin_with(fit: Fit, workers: int) -> int:
-    """As few as fit the device, but enough for every worker; `workers` is 0 where one process trains.
-
-    Raises:
-        UserError: workers need several blocks, and there is no room for the layers around one.
-    """
+    """As few as fit the device, but enough for every worker, of which 0 stands for one process. A UserError
+    if there is no room for a block among others."""
     if workers and not fit.limit:
         raise UserError(
             f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "

@@ -1,4 +1,1 @@
-"""The viewer: what keeps strangers out of it, and the panel that shows blocks, progress and memory.
-
-`guard` stands before the server, `panel` is what a user sees, `scenery` what lies in the scene.
-"""
+"""The viewer: a guard that keeps strangers out, and the panel of blocks, progress and memory."""

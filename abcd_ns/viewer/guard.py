@@ -163,10 +163,8 @@ def _own_names() -> tuple[str, ...]:
 
 
 def content_policy(host: str) -> str:
-    """A Content-Security-Policy by which the viewer's page talks to its own server alone.
-
-    viser's page asks a tracker for a script, and nerfstudio's title bar its site for a picture.
-    """
+    """A Content-Security-Policy by which the viewer's page talks to its own server alone: viser's page asks a
+    tracker for a script, and nerfstudio's title bar its site for a picture."""
     return (
         "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
         f"connect-src 'self' data: blob: ws://{host} wss://{host}; frame-ancestors 'none'; form-action 'none'"

@@ -1,7 +1,4 @@
-"""Small images in the panel, as Markdown: a curve, and a photo.
-
-viser's own plots send every browser 5 MiB of script.
-"""
+"""Small images in the panel, as Markdown; viser's own plots send every browser 5 MiB of script."""
 
 import base64
 import io

@@ -10,10 +10,10 @@ import psutil
 import torch
 import viser
 import viser.transforms as vtf
-from jaxtyping import UInt8
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
+from torch import Tensor
 
 from abcd_ns.engine import events
 from abcd_ns.engine.space.influence import worth_training
@@ -45,15 +45,10 @@ class AbcdPanel(ViewerControl):
     Args:
         model: an AbcdModel.
         views: returns the training views.
-        photo: returns the photo of a view by its index.
+        photo: returns the photo of a view by its index, uint8 [h, w, c].
     """
 
-    def __init__(
-        self,
-        model: Any,
-        views: Callable[[], list[View]],
-        photo: Callable[[int], UInt8[torch.Tensor, "h w c"]],
-    ) -> None:
+    def __init__(self, model: Any, views: Callable[[], list[View]], photo: Callable[[int], Tensor]) -> None:
         self._model, self._views, self._photo = model, views, photo
         self._coordinator: Trainer | None = None
         self._log: Any = None

@@ -1,7 +1,4 @@
-"""What the panel puts into the viewer's scene: boxes of blocks and frusta of cameras.
-
-The outermost cells are infinite, so boxes are cut to the bulk of the points.
-"""
+"""What the panel puts into the viewer's scene: boxes of blocks and frusta of cameras."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -104,7 +101,7 @@ def bulk(means: Float[Tensor, "n 3"]) -> Box:
 
 
 def boxes_of(tree: BlockTree, bounds: Box) -> dict[int, Box]:
-    """Boxes by block, cut to the bounds and a little apart; blocks outside are left out."""
+    """Boxes by block, cut to the bounds since outer cells are infinite; blocks outside are left out."""
     gap, found = GAP * float((bounds.upper - bounds.lower).norm()), {}
     for block in range(tree.num_blocks):
         cell = tree.cell(block)
@@ -122,11 +119,8 @@ def edges_of(box: Box) -> tuple[tuple[float, float, float], ...]:
 
 
 def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Where a browser looks from at first, and at what, in the viewer's units.
-
-    That is above the training camera farthest from the middle of the box, or from a corner without cameras:
-    from outside, what lies behind the scene would hide it.
-    """
+    """Where a browser looks from at first, and at what, in the viewer's units: from above the camera farthest
+    from the middle of the box, since from outside, what lies behind the scene would hide it."""
     target = (box.lower + box.upper) / 2
     centers = list(centers_of(views)) if views else [box.upper]
     eye = max(centers, key=lambda center: float((center - target).norm()))

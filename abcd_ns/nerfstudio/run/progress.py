@@ -33,7 +33,7 @@ class ProgressReport:
     """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds.
 
     Args:
-        visits: those that ended, of the whole run; the log adds to them.
+        visits: of the whole run, that ended; the log adds to them.
     """
 
     def __init__(self, coordinator: Trainer, visits: Sequence[VisitEndLine] = ()) -> None:

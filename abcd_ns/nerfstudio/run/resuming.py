@@ -53,8 +53,7 @@ def check_start(start: Start | None, folder: Path, asked: int) -> None:
         asked: `--pipeline.blocks`; 0 accepts any number.
 
     Raises:
-        UserError: `folder` holds another run's store or is being written to; or the resumed run has another
-            number of blocks.
+        UserError: `folder` has another run's store or is in use, or the resumed run has other blocks.
     """
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):

@@ -50,11 +50,7 @@ class Settings:
 
 
 def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Path) -> None:
-    """Write `folder`/settings.json with these options; the folder must exist.
-
-    Raises:
-        UserError: the disk refused.
-    """
+    """Write settings.json with these options to an existing folder; a UserError if the disk refuses."""
     data = Path(config.pipeline.datamanager.data)
     path = data.resolve()
     settings = Settings(

@@ -34,7 +34,7 @@ def at_once(say: Callable[[], None]) -> Iterator[None]:
 class StopSignals:
     """While entered, turns the first signal into Stopped: at once, or at the end of what must not be cut.
 
-    A second signal acts as usual, so that nobody has to wait. Threads other than the main one get no signals.
+    A second signal acts as usual, so that nobody has to wait. Only the main thread gets signals.
     """
 
     def __init__(self) -> None:
