@@ -29,8 +29,6 @@ UNUSED_OF_MACHINE = dict.fromkeys(
     ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
 )
 """Options of nerfstudio's viewer and machine that ABCD has no use for, and why."""
-FOLDERS = ("--output-dir", "--render-output-path")
-"""Flags of ns-export and ns-eval for folders to write to."""
 
 
 def trains_ours(words: Sequence[str]) -> bool:
@@ -90,7 +88,8 @@ def check_tool(words: Sequence[str]) -> None:
     if tool == "ns-eval" and out and not out.endswith(".json"):
         raise UserError(f"--output-path {out} must end in .json.")
     folders = [Path(out).parent] if out else []
-    folders += [Path(given) for flag in FOLDERS if (given := _value(words, flag))]
+    given = (_value(words, flag) for flag in ("--output-dir", "--render-output-path"))
+    folders += [Path(folder) for folder in given if folder]
     for folder in folders:  # the tools end with a traceback, ns-eval after all its work
         there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
         if not there.is_dir() or not os.access(there, os.W_OK):

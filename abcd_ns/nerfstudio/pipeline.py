@@ -195,8 +195,6 @@ class AbcdPipeline(VanillaPipeline):
             self.coordinator.after_step(Rendered.joined(self._drawn), self._errors)
             self._drawn = []
 
-    # -- set-up --------------------------------------------------------------------------------------
-
     def _begin(self, trainer: Any, optimizers: dict[str, Any]) -> Trainer:
         """Begin or resume, and give the model its near plane."""
         manager, model, views = self.datamanager, self.model, self.training_views()

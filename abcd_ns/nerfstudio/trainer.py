@@ -297,8 +297,6 @@ class AbcdTrainer(Trainer):
         if over and not self.config.viewer.quit_on_train_completion:  # else a script goes on
             say(next_steps(self.base_dir, self.config.pipeline.datamanager.reader().data))
 
-    # -- checkpoints ---------------------------------------------------------------------------------
-
     def _load_checkpoint(self) -> None:
         start = find_start(self.config)
         if start is None:

@@ -38,8 +38,6 @@ LEAST_CROP = 250_000
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
 COARSE_MODEL = "coarse_gaussians"
 """The limits that follow from the device's memory; a run keeps them."""
-MOST_DOWNSCALE = 64
-"""No larger factor is proposed."""
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one stored."""
 
@@ -139,7 +137,7 @@ class Demand:
 
     @property
     def at_once(self) -> int:
-        """Views that are drawn at once: one unless a limit is set, since memory is what cuts a scene."""
+        """Views that are drawn at once: one unless a limit is set, since memory is short."""
         return self.training.limits.batch_limit or 1
 
     def needs(self, blocks: int, crop_pixels: int, levels: int) -> DeviceNeeds:
@@ -255,11 +253,11 @@ def _fewest(gaussians: int, limit: int, sole: int) -> int:
 def _refusal(budget: int, demand: Demand, downscale: str, memory: str) -> str:
     """Why nothing fits, and which options would help."""
     least = _least_budget(budget, demand)
-    ways, times = f"more memory by {memory} {least:.2f}, if the device has it", 2
-    while times * demand.factor <= MOST_DOWNSCALE and _fit(budget, demand.reduced(times)) is None:
-        times *= 2
-    if times * demand.factor <= MOST_DOWNSCALE:
-        ways = f"smaller photos by {downscale} {times * demand.factor}, or {ways}"
+    ways = f"more memory by {memory} {least:.2f}, if the device has it"
+    for times in (2, 4, 8, 16, 32, 64):
+        if _fit(budget, demand.reduced(times)) is not None:
+            ways = f"smaller photos by {downscale} {times * demand.factor}, or {ways}"
+            break
     return (
         f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GiB of the device, "
         f"and {budget / GIB:.2f} GiB may be taken: give {ways}."

@@ -13,9 +13,8 @@ from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 
 MADE_FOR = "made for"
-"""The entry of a store's header that tells what it can be trained on with."""
 ASKED = "blocks asked for"
-"""The entry of a store's header that has `--pipeline.blocks` as it was when the run began."""
+"""Entries of a store's header: what can resume it, and `--pipeline.blocks` of the run that began it."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class MadeFor:
     """What a store and a run that resumes from it must agree on."""
 
     photos: str
-    """Digest of the training photos' names and sizes. Not of their folder: it may be moved."""
+    """Digest of the training photos' names and sizes; their folder may be moved."""
     first_camera: list[float]
     """Its position, world units, to three digits."""
     blocks_are_trained: str
@@ -45,7 +44,7 @@ class MadeFor:
 
     @staticmethod
     def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
-        """Of a run on these photos, taken by these cameras."""
+        """Of a run on these photos and cameras."""
         digest = hashlib.blake2b(digest_size=8)
         for photo, view in zip(photos, views, strict=True):
             digest.update(f"{photo.name} {view.width} {view.height}\n".encode("utf-8", "surrogateescape"))
@@ -69,7 +68,7 @@ class MadeFor:
         return "; ".join(f"{name.replace('_', ' ')} {theirs[name]}, not {mine[name]}" for name in different)
 
     def header(self) -> dict[str, Any]:
-        """The entry of a new store's header."""
+        """The entry of a store's header."""
         return {MADE_FOR: asdict(self)}
 
 

@@ -100,21 +100,17 @@ def test_a_file_in_another_frame_is_refused(data, trained, tmp_path, capsys):
         assert reason in capsys.readouterr().out
 
 
-def test_what_is_no_number_is_left_out_and_told(data, trained, tmp_path, capsys):
+def test_what_is_no_number_is_left_out_and_told_and_an_antialiased_file_asks_for_the_option(
+    data, trained, tmp_path, capsys
+):
     found, _ = read_gaussians(trained[1])
     found.means[0] = torch.nan
     file = tmp_path / "scene.ply"
-    write_ply(file, len(found), found.sh_degree, [found])
-    run(start_from(file, data, tmp_path / "out"))
-    assert "1 others hold NaN" in " ".join(capsys.readouterr().out.split())
-
-
-def test_an_antialiased_file_asks_for_the_option(data, trained, tmp_path, capsys):
-    found, _ = read_gaussians(trained[1])
-    file = tmp_path / "scene.ply"
     write_ply(file, len(found), found.sh_degree, [found], antialiased=True)
     run(start_from(file, data, tmp_path / "out"))
-    assert "add that" in capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 others hold NaN" in said
+    assert "--pipeline.training.antialiased True: add that" in said
 
 
 def points_alone(file: Path) -> None:

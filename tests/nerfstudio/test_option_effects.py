@@ -150,12 +150,17 @@ def test_what_a_run_writes_follows_its_options(data, tmp_path, capsys):
     (events,) = (folder / "logs").glob("events*")
     told = EventAccumulator(str(events))
     told.Reload()
-    steps = {tag: [event.step for event in told.Scalars(tag)] for tag in told.Tags()["scalars"]}
+    scalars = {tag: told.Scalars(tag) for tag in told.Tags()["scalars"]}
+    steps = {tag: [event.step for event in events] for tag, events in scalars.items()}
+    for name in ("epoch", "gaussians", "share of time for layers", "RAM (GiB)"):
+        assert f"ABCD/{name}" in scalars
+    warm_up, block = (event.value for event in scalars["ABCD/block"])
+    assert (warm_up, block in (1, 2)) == (0, True)
     assert steps["Train Loss"] == steps["ABCD/blocks"] == [0, 6]
     assert steps["Eval Loss"] == [3, 6, 9]
     assert steps["Eval Images Metrics/psnr"] == [4, 8]
     assert steps["Eval Images Metrics Dict (all images)/psnr"][:2] == [5, 10]
-    assert "Train Metrics Dict/Gradients/Total" in steps
+    assert scalars["Train Metrics Dict/Gradients/Total"][-1].value > 0
     assert "Train Iter (time)" in capsys.readouterr().out
 
 

@@ -14,7 +14,6 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.scripts import render
 from nerfstudio.scripts.eval import ComputePSNR
-from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
@@ -29,36 +28,10 @@ from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH
 STEPS = 24
 
 
-class Events(writer.Writer):
-    """What wandb or comet would be given."""
-
-    def __init__(self) -> None:
-        self.scalars: dict[str, list[tuple[int, float]]] = {}
-
-    def write_scalar(self, name, scalar, step):
-        self.scalars.setdefault(name, []).append((step, float(scalar)))
-
-    def write_image(self, name, image, step): ...
-
-    def write_config(self, name, config_dict, step): ...
-
-
 @pytest.fixture(scope="module")
-def events() -> Events:
-    return Events()
-
-
-@pytest.fixture(scope="module")
-def trained(data, events, tmp_path_factory) -> Path:
+def trained(data, tmp_path_factory) -> Path:
     """The folder of a run."""
-    config = configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)
-    config.steps_per_eval_all_images = config.steps_per_eval_batch = config.steps_per_eval_image = 10
-    config.log_gradients = True
-    writer.EVENT_WRITERS.append(events)
-    try:
-        return run(config).base_dir
-    finally:
-        writer.EVENT_WRITERS.remove(events)
+    return run(configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)).base_dir
 
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:
@@ -269,21 +242,6 @@ def test_what_a_user_can_repair_ends_a_tool_in_one_line(
     said = capsys.readouterr().out
     assert "error:" in said
     assert words in said
-
-
-# What TensorBoard, wandb and comet are given
-
-
-@pytest.mark.usefixtures("trained")
-def test_writers_are_told_where_the_training_stands(events):
-    for name in ("blocks", "epoch", "gaussians", "share of time for layers", "RAM (GiB)"):
-        assert f"ABCD/{name}" in events.scalars
-    (first, warm_up), *_, (last, block) = events.scalars["ABCD/block"]
-    assert (first, warm_up, last) == (0, 0, 20)
-    assert block in (1, 2, 3)
-    for name in ("Eval Images Metrics Dict (all images)/psnr", "Eval Images Metrics/psnr", "Eval Loss"):
-        assert [step for step, _ in events.scalars[name]] == [10, 20], name
-    assert events.scalars["Train Metrics Dict/Gradients/Total"][-1][1] > 0
 
 
 # Classes derived from ours

@@ -79,8 +79,9 @@ def test_without_the_guard_the_canary_sings(canary, monkeypatch):
 def test_the_page_is_served_and_told_to_stay_at_home(server):
     answer = ask(server, "/")
     assert status(answer) == HTTPStatus.OK
-    head = answer.partition(b"\r\n\r\n")[0].decode()
-    assert f"connect-src 'self' data: blob: ws://127.0.0.1:{server.get_port()} " in head
+    head, own = answer.partition(b"\r\n\r\n")[0].decode(), f"127.0.0.1:{server.get_port()}"
+    assert f"connect-src 'self' data: blob: ws://{own} wss://{own};" in head
+    assert "https:" not in head
     assert "X-Content-Type-Options: nosniff" in head
 
 

@@ -7,7 +7,7 @@ import pytest
 from websockets.datastructures import Headers
 
 from abcd_ns.viewer import guard
-from abcd_ns.viewer.guard import Rules, content_policy, plain_path
+from abcd_ns.viewer.guard import Rules, plain_path
 from tests.viewer.client import CAMERA
 
 
@@ -158,10 +158,3 @@ def test_only_messages_that_are_needed_are_acted_on():
     assert admits("TransformControlsUpdateMessage", **pose)
     for wrong in ({"wxyz": (0, 0, 0, 0)}, {"position": (math.nan, 0, 0)}):
         assert not admits("TransformControlsUpdateMessage", **{**pose, **wrong})
-
-
-def test_the_page_may_connect_to_its_own_server_alone():
-    policy = content_policy("127.0.0.1:7007")
-    assert "connect-src 'self' data: blob: ws://127.0.0.1:7007 wss://127.0.0.1:7007;" in policy
-    assert "https:" not in policy
-    assert "*" not in policy

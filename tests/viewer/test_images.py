@@ -21,9 +21,6 @@ def test_a_curve_is_a_small_picture_with_numbers_on_its_axes():
     assert len(svg) < 20_000
     labels = {text.text for text in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")}
     assert {"0", "100", "20"} <= labels
-
-
-def test_one_point_is_no_curve():
     assert curve_image([(0.0, 1.0)], "quality") == "Nothing to show yet."
 
 
