@@ -116,10 +116,7 @@ class AbcdDataParser(DataParser):
 
 def split_rows(centers: Float[np.ndarray, "n 3"], split: str, config: AbcdDataParserConfig) -> list[int]:
     """Rows of the name-sorted views, by their camera centers, that belong to "train", or to "val" or "test".
-
-    Raises:
-        InputError: eval_interval is below 2, or a split would be empty.
-    """
+    An InputError if eval_interval is below 2, or a split would be empty."""
     count = len(centers)
     if config.eval_mode == "all":
         return list(range(count))

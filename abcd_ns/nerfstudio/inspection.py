@@ -71,11 +71,8 @@ def inspect(config: DataParserConfig) -> Inspected:
 
 
 def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found: Inspected) -> int:
-    """Number of Gaussians in the file that a run begins with; 0 without one.
-
-    Raises:
-        UserError: it cannot be read, has too many Gaussians, or lies elsewhere than the points.
-    """
+    """Number of Gaussians in the file that a run begins with; 0 without one. A UserError if it cannot be
+    read, has too many of them, or lies elsewhere than the points."""
     if (path := model.init_splats) is None:
         return 0
     if model.random_init:

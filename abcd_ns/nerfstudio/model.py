@@ -111,8 +111,6 @@ class AbcdModel(SplatfactoModel):
             self._rasterizer = make_rasterizer(name, self.device, primitive=primitive)
         return self._rasterizer
 
-    # -- the scene -----------------------------------------------------------------------------------
-
     @property
     def tree(self) -> BlockTree:
         """How space is cut; while training, as it is now."""
@@ -148,8 +146,6 @@ class AbcdModel(SplatfactoModel):
             return active_gaussians(self.gauss_params).detach()
         return self._coordinator.scene.everything(device)
 
-    # -- checkpoints ---------------------------------------------------------------------------------
-
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """The merged scene under splatfacto's names, whatever is active."""
         state = super().state_dict(*args, **kwargs)
@@ -184,8 +180,6 @@ class AbcdModel(SplatfactoModel):
         self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
         self._poses = state.get("poses", {})
-
-    # -- pictures ------------------------------------------------------------------------------------
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """The crops of a training batch where the camera carries one, else the whole picture."""
@@ -317,8 +311,6 @@ class AbcdModel(SplatfactoModel):
         if self.crop_box is None:
             return gaussians
         return gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
-
-    # -- loss and metrics ----------------------------------------------------------------------------
 
     def get_metrics_dict(self, outputs: Values, batch: Values) -> Values:
         """PSNR, a batch's mean, and the number of Gaussians in the scene. Leaves the mean squared error of

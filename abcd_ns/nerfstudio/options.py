@@ -163,11 +163,8 @@ def _refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None
 
 
 def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
-    """Raise a UserError if a flag is no option with an effect; names the reason, or the nearest option.
-
-    Args:
-        words: of `ns-train`, after the method's name. Those after the name of a reader are not checked.
-    """
+    """Raise a UserError if one of `ns-train`'s words after the method's name is a flag without effect; names
+    the reason, or the nearest option. Words after the name of a reader are its own."""
     same = (name.replace("-", "_") for flags in SAME.values() for name in flags.values())
     taken = {f"pipeline.model.{name}" for name in (*same, *HONOURED)}
     known = {*flat_options(config)} - {f"pipeline.model.{name}" for name in MIRRORED} | taken

@@ -46,10 +46,8 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 
 def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerConfig:
-    """The viewer's options, on this machine alone unless the command line names a host.
-
-    ns-viewer replaces a run's by its own, whose default is to listen on all networks.
-    """
+    """The viewer's options, on this machine alone unless the command line names a host: by default, ns-viewer
+    listens on all networks."""
     flags = ("--viewer.websocket-host", "--viewer.websocket_host")
     named = any(argument.partition("=")[0] in flags for argument in arguments)
     if named or viewer.websocket_host not in WILDCARDS:

@@ -39,11 +39,7 @@ def check_workers(config: TrainerConfig) -> None:
 
 
 def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int) -> Workers:
-    """`count` workers with a GPU each or on a cluster, and `budget` bytes of each device.
-
-    Raises:
-        WorkersError: they cannot be had.
-    """
+    """`count` workers, each with `budget` bytes of a GPU or on a cluster; or a WorkersError."""
     pipeline, on_gpu = config.pipeline, config.machine.device_type == "cuda"
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count

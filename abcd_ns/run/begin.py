@@ -41,7 +41,6 @@ from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
 
 Say = Callable[[str], None]
-"""Takes lines for the user."""
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
 """Starts workers on GPUs or other machines, from their common setup, their number, and the bytes of a device
 that training may take."""

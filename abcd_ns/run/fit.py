@@ -175,15 +175,11 @@ def fit_run(
 def find_fit(
     budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = "--pipeline.device-budget-gb"
 ) -> Fit:
-    """The fewest blocks whose visits stay within `budget` bytes.
-
-    Where whole views leave no room, steps draw parts. One block needs no room for layers.
-
-    Args:
-        downscale, memory: the options by which photos are reduced and more memory is given.
+    """The fewest blocks whose visits stay within `budget` bytes. Where whole views leave no room, steps draw
+    parts. One block needs no room for layers.
 
     Raises:
-        UserError: there is no room for any block worth a visit; says what would help.
+        UserError: there is no room for any block worth a visit; the options `downscale` or `memory` help.
     """
     each = list(demand.with_fewer_harmonics())
     if (fit := _best(_fit(budget, one) for one in each)) is None:

@@ -80,11 +80,8 @@ def _agree(theirs: Any, mine: Any) -> bool:
 
 
 def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
-    """Make `folder` the store of a run that resumes from `start`, if it is not that store, and open it.
-
-    Raises:
-        UserError: the store cannot be read or was made for something else, or `folder` cannot be written.
-    """
+    """Make `folder` the store of a run that resumes from `start`, if it is not that store, and open it. A
+    UserError if the store cannot be read or was made for something else, or `folder` cannot be written."""
     with ParameterStore.open(start.store, start.pin, read_only=True) as old:
         made_for.check(old)
         if folder.exists() and folder.samefile(start.store):

@@ -88,10 +88,8 @@ class BlockPictures:
 
     @torch.no_grad()
     def draw(self, show: Show, block: int | None) -> Raster:
-        """What was chosen; everything if no block is given. `info` is empty.
-
-        F, B and the composite have no depth: they lie far behind whatever the browser draws over them.
-        """
+        """What was chosen; everything if no block is given. F, B and the composite have no depth: they lie
+        far behind whatever the browser draws over them."""
         if show is Show.EVERYTHING or block is None:
             return self.renderer.picture(self.view, self.settings, MIN_TRANSMITTANCE)
         own = self.renderer.scene.drawn(block, self.renderer.device)

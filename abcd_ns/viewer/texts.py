@@ -60,10 +60,8 @@ def status_of(block: int, state: RunState, active: Collection[int]) -> Status:
 
 
 def time_left(run: Trainer) -> float | None:
-    """Seconds that a run takes yet, the final pruning included, at its pace so far; None before a step.
-
-    The pruning draws some views forward and backward, and a few others ROUNDS + 1 times forward alone.
-    """
+    """Seconds that a run takes yet at its pace so far; None before a step. The final pruning draws some views
+    forward and backward, and a few others ROUNDS + 1 times forward alone."""
     config, progress, views = run.config, min(run.progress, 1.0), len(run.views)
     if not run.state.step or not progress > 0:
         return None

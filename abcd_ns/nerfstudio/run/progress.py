@@ -30,11 +30,8 @@ ALARMING = ("gradients", "moments", "values")
 
 
 class ProgressReport:
-    """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds.
-
-    Args:
-        visits: of the whole run, that ended; the log adds to them.
-    """
+    """Listens to a coordinator, and reads the `visits` to which the log adds. On a terminal it shows one live
+    line; elsewhere it prints a line every few seconds."""
 
     def __init__(self, coordinator: Trainer, visits: Sequence[VisitEndLine] = ()) -> None:
         self._coordinator, self._visits = coordinator, visits

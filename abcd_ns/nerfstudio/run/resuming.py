@@ -13,12 +13,9 @@ from abcd_ns.run.store import ASKED, Start
 
 
 def find_start(config: TrainerConfig) -> Start | None:
-    """What --load-dir, --load-step and --load-checkpoint name; None begins anew.
+    """What --load-dir, --load-step and --load-checkpoint name; None begins anew. Else a UserError says why.
 
     `--load-dir` alone takes the newest state of the run. It names its folder or `nerfstudio_models` in it.
-
-    Raises:
-        UserError: there is nothing to resume, or the options name two things.
     """
     if config.load_checkpoint is not None:
         if config.load_dir is not None or config.load_step is not None:
@@ -46,15 +43,8 @@ def pin_name(step: int) -> str:
 
 
 def check_start(start: Start | None, folder: Path, asked: int) -> None:
-    """Check what a run resumes before it writes anything.
-
-    Args:
-        folder: for its store.
-        asked: `--pipeline.blocks`; 0 accepts any number.
-
-    Raises:
-        UserError: `folder` has another run's store or is in use, or the resumed run has other blocks.
-    """
+    """Raise a UserError if the store in `folder` is another run's or in use, or the resumed run has not
+    `asked` blocks, of which 0 accepts any number."""
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):
             run = folder.parent.parent

@@ -34,7 +34,6 @@ class RunLog:
     """Listens to a coordinator and writes its events down. If the disk refuses, it says so once and ends.
 
     Args:
-        path: of the log; its folder must exist.
         meters: of what is kept in memory, by name: a function for the bytes in use, and their limit.
         earlier: the log of the run that is resumed; may be the same.
     """
