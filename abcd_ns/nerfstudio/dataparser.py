@@ -154,7 +154,7 @@ def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:
 
 
 def stored_cameras(prepared: Prepared, rows: list[int]) -> Cameras:
-    """The cameras [len(rows)] of the files, distortion included; an InputError if nerfstudio lacks them."""
+    """The cameras [len(rows)] of the files, distortion included; an InputError if nerfstudio has no such."""
     lenses = []
     for source, frame in ((prepared.sources[row], prepared.scene.frames[row]) for row in rows):
         if source.stored != source.reduced:

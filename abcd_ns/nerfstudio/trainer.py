@@ -1,11 +1,10 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
-import dataclasses
 import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +51,7 @@ def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerCon
     named = any(argument.partition("=")[0] in flags for argument in arguments)
     if named or viewer.websocket_host not in WILDCARDS:
         return viewer
-    return dataclasses.replace(viewer, websocket_host=THIS_MACHINE)
+    return replace(viewer, websocket_host=THIS_MACHINE)
 
 
 @shown(

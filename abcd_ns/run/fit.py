@@ -25,8 +25,6 @@ EXPECTED_GROWTH = 5
 """Gaussians at the end for each initial point, where no limit is set; for forecasts only."""
 FREE_SHARE = 0.9
 """Of a GPU's free memory: the rest is for what the allocator cannot use."""
-RAM_SHARE = 0.25
-"""Of the machine's RAM, where the CPU is the device."""
 LEAST_BLOCK, LEAST_LIMIT = 1_000, 100
 """Gaussians: a block with room for fewer is not worth a visit. The second holds for `gaussian_bytes`."""
 FEW = 4
@@ -93,12 +91,12 @@ class Fit:
 
 
 def device_budget(wanted_gb: float, device: torch.device) -> int:
-    """Bytes of the device that training may take; a wanted 0 takes a share of what is free."""
+    """Bytes of the device that training may take; 0 takes a share of a GPU's free memory or of the RAM."""
     if wanted_gb > 0:
         return int(wanted_gb * GIB)
     if device.type == "cuda":
         return int(FREE_SHARE * free_on_gpu(device))
-    return int(RAM_SHARE * psutil.virtual_memory().total)
+    return int(0.25 * psutil.virtual_memory().total)
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ def find_fit(
     parts. One block needs no room for layers.
 
     Raises:
-        UserError: there is no room for any block worth a visit; the options `downscale` or `memory` help.
+        UserError: no block worth a visit fits; names values of the options `downscale` and `memory` that do.
     """
     each = list(demand.with_fewer_harmonics())
     if (fit := _best(_fit(budget, one) for one in each)) is None:

@@ -19,10 +19,8 @@ from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words
 from abcd_ns.viewer.texts import clock, time_left
 
-SECONDS_BETWEEN_LINES = 10.0
-"""Where the output is no terminal, such as a log file."""
-SECONDS_BETWEEN_LOOKS = 0.1
-"""On a terminal."""
+SECONDS_BETWEEN_LINES, SECONDS_BETWEEN_LOOKS = 10.0, 0.1
+"""Where the output is no terminal, such as a log file, and where it is one."""
 SMOOTHING = 0.98
 """Weight of the PSNR that was shown before."""
 ALARMING = ("gradients", "moments", "values")
@@ -153,13 +151,16 @@ class ProgressReport:
             at = "-" if visit is None else visit.block + 1
             where = f"block {at}/{coordinator.scene.tree.num_blocks} "
         left = time_left(coordinator)  # what workers are at counts as progress, and says nothing of time
+        gpu = ""
+        if torch.cuda.is_available():
+            gpu = f"{bytes_in_words(torch.cuda.max_memory_allocated())} GPU, "
         parts = [
             f"{coordinator.progress:.1%}",
             f"{where}{what}",
             "" if left is None else f"{clock(left * (1 - (pruned or 0)))} left",
             "" if self._psnr is None else f"{self._psnr:.2f} dB training",
             f"{coordinator.count():,} Gaussians",
-            _memory(),
+            f"{gpu}{bytes_in_words(psutil.Process().memory_info().rss)} RAM",
         ]
         return [part for part in parts if part]
 
@@ -178,10 +179,3 @@ def _at_work(workers: Sequence[events.WorkerSeen]) -> str:
     busy = [str(worker.block + 1) for worker in workers if worker.block is not None]
     which = f": blocks {', '.join(busy[:4])}{', ...' if len(busy) > 4 else ''}" if busy else ""
     return f"{len(busy)} of {len(workers)} workers busy{which}"
-
-
-def _memory() -> str:
-    resident = f"{bytes_in_words(psutil.Process().memory_info().rss)} RAM"
-    if not torch.cuda.is_available():
-        return resident
-    return f"{bytes_in_words(torch.cuda.max_memory_allocated())} GPU, {resident}"

@@ -13,7 +13,7 @@ from abcd_ns.run.store import ASKED, Start
 
 
 def find_start(config: TrainerConfig) -> Start | None:
-    """What --load-dir, --load-step and --load-checkpoint name; None begins anew. Else a UserError says why.
+    """What --load-dir, --load-step and --load-checkpoint name, or a UserError; None begins anew.
 
     `--load-dir` alone takes the newest state of the run. It names its folder or `nerfstudio_models` in it.
     """
@@ -43,8 +43,8 @@ def pin_name(step: int) -> str:
 
 
 def check_start(start: Start | None, folder: Path, asked: int) -> None:
-    """Raise a UserError if the store in `folder` is another run's or in use, or the resumed run has not
-    `asked` blocks, of which 0 accepts any number."""
+    """Raise a UserError if the store in `folder` is another run's or in use, or if the resumed run has another
+    number of blocks than `asked`, where that is not 0."""
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):
             run = folder.parent.parent

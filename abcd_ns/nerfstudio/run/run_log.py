@@ -25,7 +25,7 @@ from abcd_ns.run.store import Start
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
 SAMPLES = 300
-"""Samples are 1 / SAMPLES of the time so far apart: a day's log is hardly longer than an hour's."""
+"""Gaps grow to 1 / SAMPLES of the time so far: a day's log is hardly longer than an hour's."""
 LINES_KEPT = 64
 """Lines that wait in memory for the end of a visit, at most."""
 
