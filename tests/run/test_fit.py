@@ -14,7 +14,8 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, degree_with_room, levels_of, limits_at
 from abcd_ns.errors import UserError
-from abcd_ns.run.fit import FEW, LEAST_BLOCK, Demand, Fit, RamShares, find_fit
+from abcd_ns.run.fit import FEW, LEAST_BLOCK, Demand, Fit, RamShares, find_fit, fit_run
+from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB
 from tests.reference.scenes import training_config
 
@@ -193,6 +194,12 @@ def test_a_refusal_names_options_that_help(gb, pixels, points):
     if factor := re.search(r"--pipeline\.datamanager\.dataparser\.downscale-factor (\d+)", said):
         times = int(factor[1]) // 2
         assert find_fit(int(gb * GIB), demand.reduced(times)).blocks >= 1
+
+
+def test_room_for_gaussians_alone_may_be_too_little_too():
+    with pytest.raises(UserError, match="have room for 1 Gaussians"):
+        fit_run(RunOptions(gaussian_bytes=2000), GIB, PIXELS, 1, POINTS, on_cpu=True)
+    assert fit_run(RunOptions(gaussian_bytes=GIB), 0, PIXELS, 1, POINTS, on_cpu=True).blocks == 1
 
 
 @given(st.integers(1, 2**50))

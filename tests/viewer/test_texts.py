@@ -12,23 +12,12 @@ from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer import texts
-from abcd_ns.viewer.texts import (
-    MOST_ROWS,
-    BlockRow,
-    Status,
-    block_table,
-    clock,
-    memory_table,
-    reach,
-    status_of,
-    time_left,
-    worker_line,
-)
+from abcd_ns.viewer.texts import BlockRow, Status
 
 
 def test_a_block_is_untrained_then_active_then_done():
     def statuses(state: RunState, *active: int) -> list[Status]:
-        return [status_of(block, state, active) for block in range(5)]
+        return [texts.status_of(block, state, active) for block in range(5)]
 
     state = RunState(views={0: 9, 1: 9, 2: 2, 3: 0})
     state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1), 4: BlockHealth(oversized=3)}
@@ -42,12 +31,12 @@ def test_a_block_is_untrained_then_active_then_done():
 
 def test_the_table_has_no_columns_that_nothing_is_known_of():
     rows = [BlockRow(0, Status.DONE, 1234, 15.0, 9), BlockRow(1, Status.UNDER_OBSERVED, 5, None, 1)]
-    assert block_table(rows).splitlines()[2:] == [
+    assert texts.block_table(rows).splitlines()[2:] == [
         "| 1 | done | 1,234 | 15.00 | 9 |",
         "| 2 | under-observed | 5 | - | 1 |",
     ]
     finished = [BlockRow(0, Status.DONE, 7, None, None)]
-    assert block_table(finished).splitlines() == [
+    assert texts.block_table(finished).splitlines() == [
         "| # | state | Gaussians |",
         "| ---: | --- | ---: |",
         "| 1 | done | 7 |",
@@ -57,9 +46,9 @@ def test_the_table_has_no_columns_that_nothing_is_known_of():
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
     urgent = {70: Status.UNDER_OBSERVED, 90: Status.ACTIVE}
     rows = [BlockRow(b, urgent.get(b, Status.UNTRAINED), 1, None, 9) for b in range(100)]
-    lines = block_table(rows).splitlines()
+    lines = texts.block_table(rows).splitlines()
     shown = [int(line.split("|")[1]) for line in lines if line.startswith("| ") and line[2].isdigit()]
-    assert shown == [*range(1, MOST_ROWS - 1), 71, 91]
+    assert shown == [*range(1, texts.MOST_ROWS - 1), 71, 91]
     assert lines[-1] == "100 blocks: 1 active, 1 under-observed, 98 untrained."
 
 
@@ -76,21 +65,23 @@ def a_run(step: int, progress: float, min_contribution: float = 8.0):
 
 
 def test_time_left_is_that_of_steps_and_of_the_final_pruning():
-    assert time_left(a_run(step=0, progress=0.0)) is None
-    assert time_left(a_run(step=100, progress=0.25, min_contribution=0.0)) == pytest.approx(30.0)
+    assert texts.time_left(a_run(step=0, progress=0.0)) is None
+    assert texts.time_left(a_run(step=100, progress=0.25, min_contribution=0.0)) == pytest.approx(30.0)
     pruning = 0.1 * (12.5 + 0.5 * 7 * 5)  # 400 steps: 12.5 views rank, 5 tell
-    assert time_left(a_run(step=100, progress=0.25)) == pytest.approx(30.0 + pruning)
-    assert time_left(a_run(step=100, progress=1.0)) == pytest.approx(0.1 * (5 + 0.5 * 7 * 5))
+    assert texts.time_left(a_run(step=100, progress=0.25)) == pytest.approx(30.0 + pruning)
+    assert texts.time_left(a_run(step=100, progress=1.0)) == pytest.approx(0.1 * (5 + 0.5 * 7 * 5))
 
 
 def test_words():
     waiting = WorkerSeen(1, None, 0, 0, 0, 0, 0.0)
-    assert worker_line(WorkerSeen(0, 2, 7, 40, 3, 1, 0.1)) == (
+    assert texts.worker_line(WorkerSeen(0, 2, 7, 40, 3, 1, 0.1)) == (
         "Worker 1: block 3, step 7 of 40; 3 visits, replaced 1x"
     )
-    assert worker_line(waiting) == "Worker 2: is starting; 0 visits"
-    assert (clock(3725.9), clock(None)) == ("1:02:05", "unknown")
-    assert memory_table([("RAM", 3 * 2**29, 2**34)]).splitlines()[2:] == ["| RAM | 1.5 GiB | 16.0 GiB |"]
+    assert texts.worker_line(waiting) == "Worker 2: is starting; 0 visits"
+    assert (texts.clock(3725.9), texts.clock(None)) == ("1:02:05", "unknown")
+    assert texts.memory_table([("RAM", 3 * 2**29, 2**34)]).splitlines()[2:] == [
+        "| RAM | 1.5 GiB | 16.0 GiB |"
+    ]
 
 
 @pytest.mark.parametrize("mark", [None, "a file", "Kubernetes"])
@@ -102,5 +93,5 @@ def test_a_viewer_in_a_container_names_the_flag_that_opens_it(tmp_path, monkeypa
     if mark == "Kubernetes":
         monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.0.0.1")
     for host in ("127.0.0.1", "localhost"):
-        assert ("--viewer.websocket-host 0.0.0.0" in (reach(host) or "")) == (mark is not None)
-    assert [reach(host) for host in ("0.0.0.0", "10.0.0.5", "::")] == [None] * 3  # they are open
+        assert ("--viewer.websocket-host 0.0.0.0" in (texts.reach(host) or "")) == (mark is not None)
+    assert [texts.reach(host) for host in ("0.0.0.0", "10.0.0.5", "::")] == [None] * 3  # they are open

@@ -43,8 +43,8 @@ def pin_name(step: int) -> str:
 
 
 def check_start(start: Start | None, folder: Path, asked: int) -> None:
-    """Raise a UserError if the store in `folder` is another run's or in use, or if the resumed run has another
-    number of blocks than `asked`, where that is not 0."""
+    """Raise a UserError if the store in `folder` is another run's or in use, or if the resumed run has other
+    than `asked` blocks, where that is not 0."""
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):
             run = folder.parent.parent
