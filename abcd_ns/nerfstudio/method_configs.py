@@ -33,7 +33,6 @@ PAPER = TrainingConfig(
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
 PEER_BLOCKS = 8
-"""Of the methods to compare with."""
 
 
 def _method(name: str, description: str, **pipeline) -> MethodSpecification:
