@@ -292,7 +292,16 @@ class AbcdTrainer(Trainer):
     def _say_what_is_next(self) -> None:
         over = self.pipeline.coordinator.finished and self._training_state == "completed"
         if over and not self.config.viewer.quit_on_train_completion:  # else a script goes on
-            say(next_steps(self.base_dir, self.config.pipeline.datamanager.reader().data))
+            folder, method, twice = self.checkpoint_dir, self.config.method_name, self._twice_as_long()
+            longer = command_to_resume(sys.argv, method, folder, twice)
+            say(next_steps(self.base_dir, self.config.pipeline.datamanager.reader().data, longer))
+
+    def _twice_as_long(self) -> tuple[str, str]:
+        """The option that ended the run, with twice its value."""
+        seconds, steps = self.config.pipeline.max_seconds, self.total_steps
+        if seconds is not None and self.pipeline.coordinator.state.step < steps:
+            return "--pipeline.max-seconds", f"{2 * seconds:g}"
+        return "--max-num-iterations", str(2 * steps)
 
     def _load_checkpoint(self) -> None:
         start = find_start(self.config)

@@ -45,9 +45,13 @@ def test_the_command_to_go_on_keeps_the_options(argv, expected):
 
 
 def test_what_is_next_are_commands_about_the_run():
-    lines = next_steps(Path("my run"), Path("wall")).splitlines()
+    argv = ["/usr/bin/ns-train", "abcd", "--max_num_iterations", "1000", "--data", "wall"]
+    longer = command_to_resume(argv, "abcd", Path("my run/m"), ("--max-num-iterations", "2000"))
+    lines = next_steps(Path("my run"), Path("wall"), longer).splitlines()
     assert "    abcd report 'my run' --data wall" in lines
     assert "    ns-viewer --load-config 'my run/config.yml'" in lines
+    assert lines[-1] == "    ns-train abcd --load-dir 'my run/m' --max-num-iterations 2000 --data wall"
+    assert "Train" not in next_steps(Path("run"), Path("wall"), None)
 
 
 def test_in_another_thread_signals_stay_as_they_are():

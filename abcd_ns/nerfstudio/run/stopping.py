@@ -77,26 +77,31 @@ class StopSignals:
         self._before = {}
 
 
-def command_to_resume(argv: Sequence[str], method: str, folder: Path) -> str | None:
-    """The same command with --load-dir `folder`; None if it is not `ns-train`'s."""
+def command_to_resume(
+    argv: Sequence[str], method: str, folder: Path, changed: Sequence[str] = ()
+) -> str | None:
+    """The same command with --load-dir `folder`, and an option and its value `changed`; None if it is not
+    `ns-train`'s."""
     program, *words = argv
     if Path(program).name != "ns-train" or words[:1] != [method]:
         return None
-    kept, skip = [], False
+    kept, skip = list[str](), False
     for word in words[1:]:
         name = word.partition("=")[0].replace("_", "-")
-        if skip or name in FORGOTTEN:
+        if skip or name in (*FORGOTTEN, *changed[:1]):
             skip = not skip and "=" not in word
         else:
             kept.append(word)
-    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])
+    return shlex.join(["ns-train", method, "--load-dir", str(folder), *changed, *kept])
 
 
-def next_steps(run: Path, data: Path) -> str:
-    """Commands for the finished run in a folder, each below a line that says what it does."""
+def next_steps(run: Path, data: Path, longer: str | None) -> str:
+    """Commands for the finished run in a folder, each below a line that says what it does; `longer` trains
+    twice as long."""
     steps = {
-        "A page about the run:": ["abcd", "report", str(run), "--data", str(data)],
-        "Look around in the scene:": ["ns-viewer", "--load-config", str(run / "config.yml")],
-        "A file for other viewers:": ["abcd", "export", str(run), "--out", "scene.ply"],
+        "A page about the run:": shlex.join(["abcd", "report", str(run), "--data", str(data)]),
+        "Look around in the scene:": shlex.join(["ns-viewer", "--load-config", str(run / "config.yml")]),
+        "A file for other viewers:": shlex.join(["abcd", "export", str(run), "--out", "scene.ply"]),
     }
-    return "\n".join(["Next:", *(f"  {what}\n    {shlex.join(words)}" for what, words in steps.items())])
+    steps |= {"Train twice as long:": longer} if longer else {}
+    return "\n".join(["Next:", *(f"  {what}\n    {command}" for what, command in steps.items())])
