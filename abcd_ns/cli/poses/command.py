@@ -11,7 +11,7 @@ import pycolmap
 import tyro
 from rich.console import Console
 
-from abcd_ns.cli.poses.mapping import Model, Order, Task, find_poses
+from abcd_ns.cli.poses.mapping import Order, Task, find_poses
 from abcd_ns.cli.terminal import few, print_plain
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_size
@@ -68,22 +68,22 @@ def poses(
         notes.append(f"Comparing {len(names)} photos with each other takes hours. For video: --order video.")
     for line in notes:
         print_plain(line, console)
-    model = _model(data, Task(photos, names, data / WORK, lens, not several_lenses, order, seed), console)
-    return _report(data, names, model, console)
+    task = Task(photos, names, data / WORK, lens, not several_lenses, order, seed)
+    _put_model(data / "sparse", task, console)
+    return _report(data, names, console)
 
 
-def _model(data: Path, task: Task, console: Console) -> Model:
-    """The model that is found, put in its place."""
+def _put_model(sparse: Path, task: Task, console: Console) -> None:
+    """Find poses; the model becomes `sparse`/0."""
     shutil.rmtree(task.work, ignore_errors=True)
     task.work.mkdir()
     try:
-        model = find_poses(task, console)
-        if model is None:
+        found = find_poses(task, console)
+        if found is None:
             why = "They need to overlap, and to be taken from different places."
             raise UserError(f"No two photos in {task.photos} match. {why}")
-        (data / "sparse").mkdir()
-        os.replace(model.folder, data / "sparse" / "0")
-        return model
+        sparse.mkdir()
+        os.replace(found, sparse / "0")
     finally:
         shutil.rmtree(task.work, ignore_errors=True)
 
@@ -115,11 +115,13 @@ def _unread(folder: Path) -> list[str]:
     return [f"Not read: {counted}; make JPEGs of them, by `mogrify -format jpg *{most}` for instance."]
 
 
-def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) -> int:
-    left_out, fewer_than_half = sorted(set(names) - set(model.posed)), 2 * len(model.posed) < len(names)
+def _report(data: Path, names: tuple[str, ...], console: Console) -> int:
+    model = pycolmap.Reconstruction(data / "sparse" / "0")
+    posed = {model.image(row).name for row in model.reg_image_ids()}
+    left_out, fewer_than_half = sorted(set(names) - posed), 2 * len(posed) < len(names)
     lines = [
-        f"{len(model.posed)} of {len(names)} photos have a pose, {model.points:,} points, mean error "
-        f"{model.error:.2f} px: {data / 'sparse' / '0'}"
+        f"{len(posed)} of {len(names)} photos have a pose, {model.num_points3D():,} points, mean error "
+        f"{model.compute_mean_reprojection_error():.2f} px: {data / 'sparse' / '0'}"
     ]
     if left_out:
         lines.append(f"Without a pose, and not used: {few(left_out)}. They overlap too little with others.")

@@ -11,7 +11,7 @@ from typing import Literal
 
 import pycolmap
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from abcd_ns.errors import UserError, first_line
 
@@ -46,20 +46,8 @@ class Task:
         return self.work / "database.db"
 
 
-@dataclass(frozen=True)
-class Model:
-    """The model that was found."""
-
-    folder: Path
-    posed: tuple[str, ...]
-    """Names of the photos that have a pose."""
-    points: int
-    error: float
-    """Mean reprojection error, pixels."""
-
-
-def find_poses(task: Task, console: Console) -> Model | None:
-    """Features, matches and poses, with a progress bar each; None where no two photos match.
+def find_poses(task: Task, console: Console) -> Path | None:
+    """Features, matches and poses, with a progress bar each; the model's folder, None where no photos match.
 
     Raises:
         UserError: pycolmap raised, or its process died; the message is its own.
@@ -69,10 +57,9 @@ def find_poses(task: Task, console: Console) -> Model | None:
     context = multiprocessing.get_context("spawn")
     posed = context.Value("i", 0)
     pool = ProcessPoolExecutor(1, mp_context=context, initializer=_share, initargs=(posed,))
-    columns = TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     try:
         found = pool.submit(_work, task)
-        with Progress(*columns, console=console) as bars:
+        with Progress(console=console) as bars:
             features = bars.add_task("looking for features", total=count)
             matches = bars.add_task("comparing photos", total=pairs)
             poses = bars.add_task("finding poses", total=count)
@@ -107,7 +94,7 @@ def _share(posed: Synchronized) -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
 
 
-def _work(task: Task) -> Model | None:
+def _work(task: Task) -> Path | None:
     """What the process does: the model with most photos, over the initial focal lengths."""
     pycolmap.set_random_seed(task.seed)
     pycolmap.extract_features(
@@ -122,14 +109,15 @@ def _work(task: Task) -> Model | None:
     else:
         pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
         pycolmap.match_sequential(task.database, pairing_options=pairing)
-    models = []
+    best, most = None, 0
     for factor in FOCAL_FACTORS:
-        guessed = _set_focal_lengths(task, factor)
-        models += _map(task, task.work / f"models-{factor:g}")
-        enough = any(len(model.posed) >= ENOUGH * len(task.names) for model in models)
-        if enough or not guessed:  # another start changes nothing where EXIF has all focal lengths
-            break
-    return max(models, key=lambda model: len(model.posed), default=None)
+        guessed, out = _set_focal_lengths(task, factor), task.work / f"models-{factor:g}"
+        for number, model in sorted(_map(task, out).items()):
+            if model.num_reg_images() > most:
+                best, most = out / str(number), model.num_reg_images()
+        if most >= ENOUGH * len(task.names) or not guessed:
+            break  # another start changes nothing where EXIF has all focal lengths
+    return best
 
 
 def _set_focal_lengths(task: Task, factor: float) -> bool:
@@ -144,7 +132,9 @@ def _set_focal_lengths(task: Task, factor: float) -> bool:
     return bool(guessed)
 
 
-def _map(task: Task, out: Path) -> list[Model]:
+def _map(task: Task, out: Path) -> dict[int, pycolmap.Reconstruction]:
+    """Models by the name of their folder in `out`."""
+
     def another() -> None:
         _posed.value += 1
 
@@ -153,10 +143,4 @@ def _map(task: Task, out: Path) -> list[Model]:
     options = pycolmap.IncrementalPipelineOptions(random_seed=task.seed, min_model_size=3)
     options.mapper.random_seed = task.seed
     places = task.database, task.photos, out
-    found = pycolmap.incremental_mapping(*places, options=options, next_image_callback=another)
-    models = []
-    for number, model in sorted(found.items()):
-        posed = tuple(sorted(model.image(row).name for row in model.reg_image_ids()))
-        error = model.compute_mean_reprojection_error()
-        models.append(Model(out / str(number), posed, model.num_points3D(), error))
-    return models
+    return pycolmap.incremental_mapping(*places, options=options, next_image_callback=another)
