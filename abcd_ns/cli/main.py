@@ -44,7 +44,7 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "abcd_ns.cli.demo:demo", "make a small scene, train it, show the result"),
     Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
-    Command("poses", "abcd_ns.cli.poses.command:poses", "find the camera poses of photos, by pycolmap"),
+    Command("poses", "abcd_ns.cli.poses:poses", "find the camera poses of photos, by pycolmap"),
     Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
     Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
     Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", passes_on=True),

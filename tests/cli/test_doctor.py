@@ -11,14 +11,12 @@ import torch
 from torch.utils import cpp_extension
 
 from abcd_ns.cli.doctor import command, facts
-from abcd_ns.cli.doctor.command import diagnose, doctor
+from abcd_ns.cli.doctor.command import TESTED, diagnose, doctor
 from abcd_ns.cli.doctor.facts import COMPILER, PACKAGES, Facts, find_extension
-from abcd_ns.cli.doctor.rules import TESTED
 
 GIB = 2**30
 HEALTHY = Facts(
-    abcd_ns="0.1.0",
-    python="3.11.9",
+    abcd_ns="0.1.0; Python 3.11.9",
     versions=dict.fromkeys(PACKAGES, "1.0") | TESTED,
     ray="2.60.0",
     broken={},

@@ -10,8 +10,7 @@ from PIL import Image
 from rich.console import Console
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from abcd_ns.cli.poses import command, mapping
-from abcd_ns.cli.poses.command import poses
+from abcd_ns.cli import poses
 from abcd_ns.errors import UserError
 from tests.data.dataparser_scenes import parser
 
@@ -58,7 +57,7 @@ def found(places, tmp_path_factory) -> Path:
     textures = np.clip(128 + 150 * smooth, 0, 255)
     for name, place in places.items():
         corner_of_a_room(place, textures).save(data / "images" / name)
-    assert poses(data) == 0
+    assert poses.poses(data) == 0
     return data
 
 
@@ -78,7 +77,7 @@ def test_cameras_are_where_they_were(places, found):
     assert len(outputs.metadata["points3D_xyz"]) > 100
     assert sorted(path.name for path in found.iterdir()) == ["images", "sparse"]
     with pytest.raises(UserError, match="exists already"):
-        poses(found)
+        poses.poses(found)
 
 
 def write_blank(data: Path, count: int) -> None:
@@ -90,31 +89,31 @@ def write_blank(data: Path, count: int) -> None:
 def test_photos_that_show_nothing_are_refused_and_nothing_is_left(tmp_path):
     write_blank(tmp_path, 4)
     with pytest.raises(UserError, match="No two photos"):
-        poses(tmp_path)
+        poses.poses(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
 def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "find_poses", None)
+    monkeypatch.setattr(poses, "find_poses", None)
     write_blank(tmp_path, 2)
     (tmp_path / "images" / "2.png").write_bytes(b"no picture")
     with pytest.raises(UserError, match=r"2\.png"):
-        poses(tmp_path)
+        poses.poses(tmp_path)
     shutil.rmtree(tmp_path / "images")
     write_blank(tmp_path, 3)
     with pytest.raises(UserError, match="--lens EYE is no camera model"):
-        poses(tmp_path, lens="EYE")
+        poses.poses(tmp_path, lens="EYE")
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
 def test_photos_of_two_sizes_have_two_lenses(tmp_path, monkeypatch, capsys):
     write_blank(tmp_path, 3)
-    tasks: list[mapping.Task] = []
-    monkeypatch.setattr(command, "find_poses", lambda task, _: tasks.append(task))
+    tasks: list[poses.Task] = []
+    monkeypatch.setattr(poses, "find_poses", lambda task, _: tasks.append(task))
     for size in ((64, 48), (48, 64)):
         Image.new("RGB", size).save(tmp_path / "images" / "9.png")
         with pytest.raises(UserError, match="No two photos"):
-            poses(tmp_path)
+            poses.poses(tmp_path)
     assert [task.one_lens for task in tasks] == [True, False]
     assert "Photos of 2 sizes" in capsys.readouterr().out
 
@@ -124,15 +123,15 @@ def test_what_phones_write_and_nothing_reads_is_told(tmp_path, monkeypatch, caps
     for name in ("a.HEIC", "b.HEIC", "c.CR2", "notes.txt"):
         (tmp_path / "images" / name).touch()
     with pytest.raises(UserError, match=r"has 2 photos.* Not read: 1 \.CR2, 2 \.HEIC; .*jpg \*\.HEIC"):
-        poses(tmp_path)
+        poses.poses(tmp_path)
     Image.new("RGB", (64, 48)).save(tmp_path / "images" / "2.png")
-    monkeypatch.setattr(command, "find_poses", lambda *_: None)
+    monkeypatch.setattr(poses, "find_poses", lambda *_: None)
     with pytest.raises(UserError, match="No two photos"):
-        poses(tmp_path)
+        poses.poses(tmp_path)
     assert "Not read: 1 .CR2, 2 .HEIC" in capsys.readouterr().out
 
 
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
-    task = mapping.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
+    task = poses.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
     with pytest.raises(UserError):
-        mapping.find_poses(task, Console(quiet=True))
+        poses.find_poses(task, Console(quiet=True))

@@ -1,1 +1,1 @@
-"""`abcd doctor`: `facts` looks, `rules` judge."""
+"""`abcd doctor`: `facts` looks, `command` judges."""

@@ -1,15 +1,15 @@
 """`abcd doctor`: what this machine and environment are, whether they can train, and what to do where not."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 from rich.console import Console
 
-from abcd_ns.cli.doctor.facts import Facts, gather
-from abcd_ns.cli.doctor.rules import findings_of
-from abcd_ns.cli.findings import Finding, by_level, print_findings
+from abcd_ns.cli.doctor.facts import COMPILER, EXPORT, Facts, gather
+from abcd_ns.cli.findings import Finding, by_level, error, note, print_findings, warning
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.machine import without_home
-from abcd_ns.units import bytes_in_words
+from abcd_ns.units import GIB, bytes_in_words
 
 CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
@@ -17,6 +17,13 @@ MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
 DETAILS = ("os", "driver", "torch_cuda", "lpips_missing")
 """Facts that only --verbose shows, beside the other packages' versions."""
+TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
+"""Versions whose insides are relied on."""
+LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
+"""Free bytes below which runs of usual size end early."""
+SYSTEM_LIBRARIES = "sudo apt-get install libgl1 libegl1 libgomp1 libusb-1.0-0 libx11-6"
+NMS = "torchvision::nms"
+"""In the error of a torchvision that was built for another torch."""
 
 
 def doctor(*, verbose: bool = False) -> int:
@@ -46,15 +53,15 @@ def doctor(*, verbose: bool = False) -> int:
 
 
 def diagnose(facts: Facts) -> tuple[Finding, ...]:
-    """What follows from the facts, the most serious first."""
-    found = findings_of(facts)
+    """All that is wrong, the most serious first."""
+    found = [*_of_packages(facts), *_of_the_machine(facts), *_of_kernels(facts)]
     return by_level(replace(f, what=without_home(f.what), fix=without_home(f.fix)) for f in found)
 
 
 def _rows(f: Facts) -> dict[str, str]:
     """What is always shown."""
     rows = {
-        "abcd_ns": f"{f.abcd_ns}; Python {f.python}",
+        "abcd_ns": f.abcd_ns,
         "packages": ", ".join(f"{name} {f.versions.get(name) or 'not installed'}" for name in MAIN),
         "GPU": f.gpu or "none: training runs on the CPU, which is meant for small pictures",
         "CPU": f"{f.cpu}, {f.cores} cores" if f.cpu else "unknown, as torch does not start",
@@ -80,3 +87,94 @@ def _workers(f: Facts) -> str:
     if f.gpu or f.cores < 2:
         return f"none here: one {'GPU' if f.gpu else 'core'}"
     return f"up to {f.cores}, one for each core, for two blocks each"
+
+
+def _of_packages(f: Facts) -> Iterator[Finding]:
+    if missing := [name for name, version in f.versions.items() if version is None]:
+        fix = "In the checkout of abcd_ns: pip install ."
+        yield error("missing-packages", f"Not installed: {', '.join(missing)}.", fix)
+    for module, why in f.broken.items():
+        if module == EXPORT:
+            what = f"ns-export and abcd mesh cannot start, as {module} does not: {why}"
+            yield warning("broken-export", what, f"On Debian and Ubuntu: {SYSTEM_LIBRARIES}")
+        elif NMS in why:
+            what = f"torch and torchvision do not belong together: {why}"
+            yield error("broken-package", what, "Install both from the same place, of versions that match.")
+        else:
+            fix = f"Install it again; if a lib*.so is missing, {SYSTEM_LIBRARIES}"
+            yield error("broken-package", f"{module} does not start: {why}", fix)
+    if not f.registered:
+        what = "nerfstudio does not know the methods of abcd_ns: it is not installed in this environment."
+        yield error("not-registered", what, "In its checkout: pip install .")
+    if not f.has_ns_train:
+        fix = "Install nerfstudio into this environment, or activate the one that has it."
+        yield error("no-ns-train", "There is no command ns-train beside this Python.", fix)
+    for name, tested in TESTED.items():
+        version = f.versions[name] or tested
+        if version.split("+")[0] != tested:
+            what = f"{name} is {version}; abcd_ns was tested with {tested} and relies on its insides."
+            yield warning("untested-version", what, f"If something fails, try pip install {name}=={tested}")
+
+
+def _of_the_machine(f: Facts) -> Iterator[Finding]:
+    if f.disk_free_bytes < LITTLE_DISK:
+        yield warning(
+            "little-disk",
+            f"Only {bytes_in_words(f.disk_free_bytes)} of disk are free here. A run's blocks take six times "
+            "the size of the scene, and each checkpoint once that.",
+            "Make room, or give ns-train --output-dir FOLDER on another disk.",
+        )
+    if f.ram_free_bytes < LITTLE_RAM:
+        yield warning(
+            "little-ram",
+            f"Only {bytes_in_words(f.ram_free_bytes)} of RAM are free. By default photos, blocks and layers "
+            "take up to 8 GiB of it, or 40% of all.",
+            "Close other programs, or lower ns-train's --pipeline.ram-budget-gb",
+        )
+    if f.cpu is None or f.gpu:
+        return
+    there = f"There is an NVIDIA device (driver {f.driver}), but torch"
+    if f.driver is None:
+        what = "No CUDA device: training runs on the CPU. That is meant for pictures some 160 to 320 px wide."
+        yield note("no-gpu", what)
+    elif f.torch_cuda is None:
+        fix = "Install torch and torchvision as built for CUDA."
+        yield warning("torch-without-cuda", f"{there} is built for the CPU only.", fix)
+    else:
+        fix = "Update the driver, or install torch for an older CUDA; look at CUDA_VISIBLE_DEVICES."
+        yield warning("cuda-unavailable", f"{there}, built for CUDA {f.torch_cuda}, cannot use it.", fix)
+
+
+def _of_kernels(f: Facts) -> Iterator[Finding]:
+    if f.folder is None:
+        return
+    if f.gpu and f.gsplat is None:
+        yield _unbuilt(f)
+    if not f.gpu and not f.built and not f.build_tools[COMPILER]:
+        what = "There is no C++ compiler for the CPU rasterizer. Training works, some 20 times slower."
+        yield warning("no-compiler", what, "Install one: sudo apt-get install g++")
+    if f.failed:
+        fix = f"Delete {f.folder}, so that its library is compiled anew."
+        yield error("self-check", f"The CPU rasterizer: {f.failed}", fix)
+    if f.lpips_missing:
+        what = f"{f.lpips_missing}. Nothing is downloaded by default. Until then scores are PSNR and SSIM."
+        yield note("no-lpips", what)
+
+
+def _unbuilt(f: Facts) -> Finding:
+    """Whether gsplat's kernels, which are not there, can be built."""
+    none, nvcc = "gsplat's CUDA kernels are not built.", f.build_tools["nvcc"]
+    if missing := ", ".join(name for name, there in f.build_tools.items() if not there):
+        what = f"{none} To build them, the PATH lacks {missing}."
+        fix = f"Install the CUDA toolkit {f.torch_cuda} (nvcc), g++ and ninja. Or train slowly, with "
+        return error("gsplat-cannot-be-built", what, fix + "--pipeline.model.rasterizer torch")
+    if nvcc.split(".")[0] != (f.torch_cuda or "").split(".")[0]:
+        what = f"{none} nvcc is of CUDA {nvcc}, torch of {f.torch_cuda}: it compiles with no other."
+        fix = f"Put the nvcc of CUDA {f.torch_cuda} first on the PATH, or install torch for {nvcc}."
+        return error("gsplat-cannot-be-built", what, fix)
+    return note(
+        "gsplat-not-built",
+        f"{none} The first training or `abcd plan` compiles them, once: some 20 minutes of CPU time, spread "
+        "over up to 10 processes.",
+        "If that takes too much RAM, set MAX_JOBS=2 for it.",
+    )

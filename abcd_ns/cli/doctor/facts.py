@@ -41,8 +41,7 @@ class Facts:
     """The machine and the environment. Where torch does not start, what it tells is left at its default."""
 
     abcd_ns: str
-    """Version and commit."""
-    python: str
+    """Version and commit, and Python's version."""
     versions: dict[str, str | None]
     """Of PACKAGES; None where one is not installed."""
     ray: str | None
@@ -90,14 +89,14 @@ def gather() -> Facts:
     broken = {module: error for module, error in tried.items() if error is not None}
     memory, place = psutil.virtual_memory(), Path("outputs") if Path("outputs").is_dir() else Path()
     number, plus, changes = (own_commit() or "").partition("+")
+    commit = f", commit {number[:10]}{plus}{changes}" if number else ""
     driver = output_of("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
     return Facts(
-        abcd_ns=__version__ + (f", commit {number[:10]}{plus}{changes}" if number else ""),
-        python=platform.python_version(),
+        abcd_ns=f"{__version__}{commit}; Python {platform.python_version()}",
         versions={name: package_version(name) for name in PACKAGES},
         ray=package_version("ray"),
         broken=broken,
-        registered="abcd" in {entry.name for entry in entry_points(group="nerfstudio.method_configs")},
+        registered="abcd" in entry_points(group="nerfstudio.method_configs").names,
         has_ns_train=find_tool("ns-train") is not None,
         os=f"{platform.system()} {platform.release()} {platform.machine()}",
         ram_bytes=memory.total,
@@ -122,14 +121,12 @@ def _start(module: str) -> str | None:
 
 def _start_apart(module: str) -> str | None:
     command = [sys.executable, "-c", f"import {module}"]
-    try:
-        run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    except (OSError, subprocess.SubprocessError) as error:
-        return str(error)
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
     return None if run.returncode == 0 else (run.stderr.strip().splitlines() or ["it crashed"])[-1]
 
 
 def _seen_by_torch() -> dict[str, Any]:
+    """The fields of Facts from `cpu` to `torch_cuda`."""
     import torch
 
     machine, gpu = describe_machine(), None
@@ -144,7 +141,7 @@ def _seen_by_torch() -> dict[str, Any]:
 
 
 def _kernels() -> dict[str, Any]:
-    """The fields of Facts from `folder` on: what is built, what could be, and whether it computes right."""
+    """The fields of Facts from `folder` on."""
     from abcd_ns.engine.kernels import find_compiler, kernels_folder
     from abcd_ns.engine.kernels.native import library_path
     from abcd_ns.engine.render import TorchRasterizer, self_check
@@ -171,8 +168,8 @@ def _kernels() -> dict[str, Any]:
 def find_extension() -> Path | None:
     """gsplat's CUDA kernels, from its wheel or from an earlier run."""
     package = importlib.util.find_spec("gsplat")
-    folders = [Path(folder) for folder in package.submodule_search_locations or ()] if package else []
-    found = [*(path for folder in folders for path in folder.glob("csrc*.so")), built_extension()]
+    folders = package.submodule_search_locations if package else []
+    found = [*(path for folder in folders for path in Path(folder).glob("csrc*.so")), built_extension()]
     return next((path for path in found if path.is_file()), None)
 
 

@@ -1,1 +1,0 @@
-"""`abcd poses`: `mapping` runs pycolmap in a process of its own, which can be stopped."""
