@@ -1,24 +1,55 @@
 """`abcd report`: one training run as one HTML page that needs nothing else."""
 
+import base64
+import hashlib
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from nerfstudio.cameras.cameras import Cameras
 from rich.console import Console
 
 from abcd_ns import __version__
 from abcd_ns.cli.paths import check_file, find_run
-from abcd_ns.cli.report.held_out import look_at_held_out
-from abcd_ns.cli.report.page import GENERATOR, render_page
+from abcd_ns.cli.report import charts
+from abcd_ns.cli.report.figures import (
+    BLOCK_TITLES,
+    as_text,
+    block_rows,
+    changed_options,
+    more_figures,
+    tiles,
+    training_command,
+)
+from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
+from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
+from abcd_ns.lab.compare.pictures import ERROR_GAIN
+from abcd_ns.lab.results.tables import NOTHING, about_machine
 from abcd_ns.lab.runs.options import check_ranges
+from abcd_ns.machine import without_home
+from abcd_ns.nerfstudio.run.log_lines import EndLine, TrainingLine
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 
 PAGE_FILE = "report.html"
+GENERATOR = "abcd report"
+"""Begins the page's generator, by which a page of ours is known."""
+HERE = Path(__file__).parent
+SCRIPT = """
+for (const slider of document.querySelectorAll(".slider")) {
+  const range = slider.querySelector("input");
+  const show = () => slider.style.setProperty("--at", range.value + "%");
+  range.addEventListener("input", show);
+  show();  // a browser that goes back to the page keeps the range's value
+}
+"""
 
 
 def report(
@@ -54,7 +85,7 @@ def report(
             pipeline = load_pipeline(found, data)
             sets = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
             cameras = [each.cameras for each in sets]
-            held_out = look_at_held_out(pipeline, pictures, console)
+            held_out = look_at_held_out(pipeline, pictures)
         except UserError as error:  # photos may go missing until they are read
             notes.append(f"Held-out views could not be drawn. {error}")
     page = render_page(found, held_out, cameras, notes)
@@ -88,3 +119,50 @@ def _notes(run: RunFolder, data: Path | None) -> list[str]:
         given = one_line(shlex.quote(run.settings.data_path))
         notes.append(f"Held-out views and their photos are shown if their folder is named: --data {given}")
     return notes
+
+
+def render_page(
+    run: RunFolder, held_out: HeldOut | None, cameras: Sequence[Cameras] = (), notes: Sequence[str] = ()
+) -> str:
+    """The whole page. Every text in it is escaped by the template; its script is the only one that may run.
+
+    Args:
+        held_out: None where the held-out views could not be drawn.
+        cameras: those trained on, and those held out; none where the data is gone.
+        notes: what the reader must know first.
+    """
+    settings, story, checkpoint = run.settings, run.story, run.checkpoint
+    psnr = held_out and held_out.mean("psnr_merged")
+    views = held_out.shown if held_out else ()
+    versions = vars(settings.versions) | {"machine": about_machine(settings.machine)}
+    pages = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
+    return pages.get_template("page.html").render(
+        generator=f"{GENERATOR} {__version__}",
+        script=Markup(SCRIPT),
+        # As a Content-Security-Policy names the one script that may run.
+        script_hash="sha256-" + base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode(),
+        css=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        settings=settings,
+        unfinished=_unfinished(story),
+        tiles=tiles(run, held_out),
+        notes=[without_home(note) for note in notes],
+        quality=charts.draw_quality(story, psnr and (checkpoint.step, psnr), settings.method),
+        progress=charts.draw_progress(story),
+        first=views[(len(views) - 1) // 2] if views else None,
+        views=views,
+        held_out=held_out,
+        error_limit=f"{100 / ERROR_GAIN:g}%",
+        map=charts.draw_map(checkpoint, cameras) if checkpoint and len(checkpoint.means) else None,
+        figures=more_figures(run, held_out).items(),
+        block_titles=BLOCK_TITLES,
+        blocks=block_rows(run),
+        changed=changed_options(settings),
+        options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
+        command=without_home(training_command(settings)),
+        versions=[(name, value or NOTHING) for name, value in versions.items()],
+    )
+
+
+def _unfinished(story: Story) -> list[str]:
+    resumed = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]
+    return resumed if story.last(EndLine) else [*resumed, "not ended: still running, or interrupted"]

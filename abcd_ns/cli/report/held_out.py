@@ -7,8 +7,6 @@ from io import BytesIO
 import matplotlib
 import numpy as np
 from PIL import Image
-from rich.console import Console
-from torch import Tensor
 
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
@@ -58,21 +56,21 @@ class HeldOut:
         return mean([getattr(view, name) for view in self.scores])
 
 
-def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) -> HeldOut:
+def look_at_held_out(pipeline: AbcdPipeline, pictures: int) -> HeldOut:
     """Draw and score every held-out view; keep pictures of `pictures` of them: best, worst and between."""
-    scores, gaps = [], []
-    count = len(pipeline.datamanager.eval_dataset)
-    for drawn in tracked(draw_held_out(pipeline), "Held-out views", count, console):
+    scores, gaps, count = [], [], len(pipeline.datamanager.eval_dataset)
+    for drawn in tracked(draw_held_out(pipeline), "Held-out views", count):
         scores.append(drawn.score)
         gaps.append(drawn.squared_gap)
     gap, note = ordering_gap(gaps, pipeline.model.tree.num_blocks) if scores else (None, "no held-out view")
-    places, shown = pick(scores, pictures), {}
-    for drawn in tracked(draw_held_out(pipeline, places), "Pictures", len(places), console):
-        row = drawn.row
-        shown[row] = _show(drawn, scores[row], places[row], len(places))
-    said = note if gap is None else f"{gap:.1f} dB"
+    places = pick(scores, pictures)
+    shown = {
+        drawn.row: _show(drawn, scores[drawn.row], places[drawn.row], len(places))
+        for drawn in tracked(draw_held_out(pipeline, places), "Pictures", len(places))
+    }
     views = evenly([view for view in pipeline.training_views() if view.nearest], FOG_VIEWS)
-    fog = tuple(pipeline.model.fog(view) for view in tracked(views, "Fog", console=console))
+    fog = tuple(pipeline.model.fog(view) for view in tracked(views, "Fog"))
+    said = note if gap is None else f"{gap:.1f} dB"
     return HeldOut(tuple(scores), said, tuple(shown[row] for row in places), fog)
 
 
@@ -85,24 +83,21 @@ def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
     return {ranked[rank].row: words.get(rank, f"{rank + 1} of {last + 1}") for rank in ranks}
 
 
-def _resized(picture: PictureArray, width: int, height: int) -> str:
-    """A picture, uint8 [h, w, 3], in another size, as a PNG or JPEG that stands in the page itself."""
-    stream, kind = BytesIO(), "png" if width * height <= LOSSLESS_PIXELS else "jpeg"
-    small = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
-    small.save(stream, kind, quality=88, optimize=True)
-    return data_uri(stream, kind)
-
-
-def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
-    photo, picture = _to_bytes(drawn.photo), _to_bytes(drawn.merged)
+def _show(drawn: Drawn, score: ViewScore, place: str, count: int) -> Shown:
+    photo, picture = (
+        (image.clamp(0, 1) * 255).round().byte().cpu().numpy() for image in (drawn.photo, drawn.merged)
+    )
     amplified = np.clip(error_map(picture, photo) * ERROR_GAIN, 0, 1)
     error = matplotlib.colormaps[ERROR_COLORS](amplified, bytes=True)[..., :3]
     height, width = photo.shape[:2]
     scale = min(1.0, (PAGE_PIXELS / (3 * count * height * width)) ** 0.5)
-    width, height = max(round(width * scale), 1), max(round(height * scale), 1)
-    uris = [_resized(image, width, height) for image in (photo, picture, error)]
-    return Shown(scored, place, *uris, width, height)
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return Shown(score, place, *(_resized(image, size) for image in (photo, picture, error)), *size)
 
 
-def _to_bytes(picture: Tensor) -> PictureArray:
-    return (picture.clamp(0, 1) * 255).round().byte().cpu().numpy()
+def _resized(picture: PictureArray, size: tuple[int, int]) -> str:
+    """A picture, uint8 [h, w, 3], in another size, as a PNG or JPEG that stands in the page itself."""
+    stream, kind = BytesIO(), "png" if size[0] * size[1] <= LOSSLESS_PIXELS else "jpeg"
+    small = Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS)
+    small.save(stream, kind, quality=88, optimize=True)
+    return data_uri(stream, kind)
