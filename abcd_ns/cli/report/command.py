@@ -38,18 +38,9 @@ from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.run.log_lines import EndLine, TrainingLine
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 
-PAGE_FILE = "report.html"
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
 HERE = Path(__file__).parent
-SCRIPT = """
-for (const slider of document.querySelectorAll(".slider")) {
-  const range = slider.querySelector("input");
-  const show = () => slider.style.setProperty("--at", range.value + "%");
-  range.addEventListener("input", show);
-  show();  // a browser that goes back to the page keeps the range's value
-}
-"""
 
 
 def report(
@@ -76,7 +67,7 @@ def report(
     """
     check_ranges({"pictures": pictures})
     folder = find_run(run, SETTINGS_FILE)
-    out = folder / PAGE_FILE if out is None else out
+    out = out or folder / "report.html"
     _check_page(out)
     console, found = Console(), open_run(folder)
     held_out, cameras, notes = None, [], _notes(found, data)
@@ -88,8 +79,8 @@ def report(
             held_out = look_at_held_out(pipeline, pictures)
         except UserError as error:  # photos may go missing until they are read
             notes.append(f"Held-out views could not be drawn. {error}")
-    page = render_page(found, held_out, cameras, notes)
-    out.write_text(page, "utf-8", "backslashreplace")  # a file's name may have bytes that are no text
+    # A file's name may have bytes that are no text.
+    out.write_text(render_page(found, held_out, cameras, notes), "utf-8", "backslashreplace")
     for note in notes:
         print_plain(note, console, "yellow")
     print_plain(f"{out} ({out.stat().st_size / 2**20:.1f} MiB)", console)
@@ -135,13 +126,14 @@ def render_page(
     psnr = held_out and held_out.mean("psnr_merged")
     views = held_out.shown if held_out else ()
     versions = vars(settings.versions) | {"machine": about_machine(settings.machine)}
+    css, script = ((HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     pages = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("page.html").render(
         generator=f"{GENERATOR} {__version__}",
-        script=Markup(SCRIPT),
+        css=Markup(css),
+        script=Markup(script),
         # As a Content-Security-Policy names the one script that may run.
-        script_hash="sha256-" + base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode(),
-        css=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        script_hash="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         settings=settings,
         unfinished=_unfinished(story),
         tiles=tiles(run, held_out),

@@ -64,7 +64,8 @@ class RunFolder:
 
 def open_run(path: Path) -> RunFolder:
     """Read a run's settings, log, newest checkpoint and state; UserError where one cannot be read."""
-    settings, story = _read_settings(path), read_story(path / STATE / LOG_FILE)
+    settings = read_record(path / STATE / SETTINGS_FILE, Settings, SCHEMA)
+    story = read_story(path / STATE / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
     if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
         story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
@@ -80,8 +81,7 @@ def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
     """
     config, checkpoint = pipeline_config(run.path, data), run.checkpoint
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    pipeline = config.setup(device=device, test_mode="test")
-    pipeline.eval()
+    pipeline = config.setup(device=device, test_mode="test").eval()
     try:
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
@@ -101,7 +101,7 @@ def pipeline_config(run: Path, data: Path) -> AbcdPipelineConfig:
     Raises:
         UserError: an option leads out of `data`, or is none of this version.
     """
-    settings, prefix = _read_settings(run), "pipeline."
+    settings, prefix = read_record(run / STATE / SETTINGS_FILE, Settings, SCHEMA), "pipeline."
     where = _settings_file(run, settings)
     options = {n.removeprefix(prefix): v for n, v in settings.options.items() if n.startswith(prefix)}
     config = registered_config(settings).pipeline
@@ -109,10 +109,6 @@ def pipeline_config(run: Path, data: Path) -> AbcdPipelineConfig:
     _check_paths(options, data, where)
     config.datamanager.data = data
     return config
-
-
-def _read_settings(run: Path) -> Settings:
-    return read_record(run / STATE / SETTINGS_FILE, Settings, SCHEMA)
 
 
 def _settings_file(run: Path, settings: Settings) -> str:
@@ -129,10 +125,8 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
         of_data = name.startswith("datamanager.") and not name.endswith(".data")
         if not of_data or not isinstance(value, str):
             continue
-        what = one_line(f"pipeline.{name} is {value}")
-        if "\0" in value:
-            raise UserError(f"{where}: {what}, which is no path; correct it there.")
-        if not (folder / value).resolve().is_relative_to(folder):
+        if "\0" in value or not (folder / value).resolve().is_relative_to(folder):
+            what = one_line(f"pipeline.{name} is {value}")
             raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
 
 
@@ -162,7 +156,6 @@ def _newest(folder: Path) -> Checkpoint | None:
 
 
 def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState:
-    """The planner's state at the checkpoint, or else as saved last."""
     if not folder.is_dir():
         return RunState()
     try:

@@ -1,6 +1,6 @@
 """A run's log, read back: what happened when."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -91,9 +91,8 @@ def read_story(path: Path) -> Story:
     training = story.last(TrainingLine)
     if training is None:
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    visits = (*story.of(VisitLine), *story.visits)
-    numbers = [1 + visit.block for visit in visits if visit.block is not None]
-    return Story(story.lines, max([training.blocks, *numbers]))
+    visited = [visit.block for visit in (*story.of(VisitLine), *story.visits) if visit.block is not None]
+    return replace(story, blocks=max([training.blocks, *(block + 1 for block in visited)]))
 
 
 def _read_line(text: bytes, where: str) -> Line:

@@ -37,17 +37,14 @@ def test_a_sound_scene_is_summed_up(sound, found, capsys):
     assert sorted(sound.rglob("*")) == before
 
     printed = capsys.readouterr().out
-    summary, findings = examine(sound)
-    assert findings == ()
-    assert summary["photos"] == len(NAMES)
-    assert summary["sizes"] == {f"{w} x {h}": 5 for w, h in SIZES}
-    assert (summary["train"], summary["held_out"], summary["points"]) == (8, 2, POINTS)
-    assert summary["photo_bytes"] == sum(5 * 3 * w * h for w, h in SIZES)
-    near = summary["near_plane_model"]  # half the depth of the nearest point in a picture that is trained on
-    assert near == pytest.approx(min(depths_in_training(found)) / 2, rel=0.05)
-    assert summary["near_plane"] == pytest.approx(near * found.prepared.similarity.scale, rel=1e-6)
+    assert examine(sound)[1] == ()
+    assert found.photo_bytes == sum(5 * 3 * w * h for w, h in SIZES)
+    # Half the depth of the nearest point in a picture that is trained on.
+    near = min(depths_in_training(found)) / 2
+    assert found.near == pytest.approx(near * found.prepared.similarity.scale, rel=0.05)
     assert f"is fine: ns-train abcd --data {sound}\n" in printed
-    for part in ("10, 5 of", "600", "8 to train on, 2 held out"):
+    sizes = [f"5 of {w} x {h} px" for w, h in SIZES]
+    for part in (f" {len(NAMES)}, ", *sizes, f"{POINTS}, nine tenths", "8 to train on, 2 held out"):
         assert part in printed
 
 
@@ -83,8 +80,8 @@ def test_what_training_refuses_is_refused_in_the_same_lines(scene, tmp_path, cap
     printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert [line for line in printed if "input: " in line] == [f"input: {e}" for e in refused.value.lines]
     assert sorted(tmp_path.rglob("*")) == before
-    summary, findings = examine(scene)
-    assert summary is None
+    found, findings = examine(scene)
+    assert found is None
     assert {finding.level for finding in findings} == {"error"}
 
 
