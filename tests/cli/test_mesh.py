@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ from abcd_ns.cli.mesh.surface import Piece, weld, without_specks
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
-from abcd_ns.engine.layers.surface import median_depth
-from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -69,11 +66,8 @@ def maps(request, tmp_path_factory) -> DepthMaps:
     parted = MemoryScene(build_kd(scene.means, 2), scene)
     renderer = LayerRenderer(parted, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
     assert len(renderer.nodes()) == 2
-    settings = RenderSettings(sh_degree=3)
-    median = None if request.param == "expected" else partial(median_depth, renderer, settings=settings)
-    maps = DepthMaps(tmp_path_factory.mktemp("maps"))
-    maps.draw(WholePictures(renderer, settings), views, lambda: None, median)
-    return maps
+    median = request.param == "median"
+    return DepthMaps(tmp_path_factory.mktemp("maps"), renderer, RenderSettings(sh_degree=3), views, median)
 
 
 def fused(maps: DepthMaps, part_boxes: int) -> tuple[list[int], Piece]:
@@ -85,8 +79,8 @@ def fused(maps: DepthMaps, part_boxes: int) -> tuple[list[int], Piece]:
             boxes.append(count)
             return super()._grid(count)
 
-    fusion = Watched(maps, VOXEL, lambda: None, part_boxes)
-    surface = weld(list(fusion.pieces(lambda: None)))
+    fusion = Watched(maps, VOXEL, part_boxes)
+    surface = weld(list(fusion.pieces()))
     assert len(boxes) == 1 + fusion.parts  # the first one is empty
     return boxes[1:], surface
 
@@ -122,15 +116,12 @@ def test_parts_make_the_same_surface_bit_for_bit_and_a_part_at_a_time_is_in_ram(
 
 @pytest.mark.parametrize("maps", ["expected"], indirect=True)
 def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
-    far = Fusion(maps, VOXEL / 100, lambda: None)
-    assert list(far.pieces(lambda: None)) == []
+    assert list(Fusion(maps, VOXEL / 100).pieces()) == []
     scene, views = sphere(), maps.views[:2]
     scene.opacities[:] = -5.0
     whole = MemoryScene(build_kd(scene.means, 1), scene)
     renderer = LayerRenderer(whole, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
-    faint = DepthMaps(tmp_path)
-    faint.draw(WholePictures(renderer, RenderSettings(sh_degree=3)), views, lambda: None)
-    assert not len(faint.footprints())
+    assert not len(DepthMaps(tmp_path, renderer, RenderSettings(sh_degree=3), views).footprints())
 
 
 def test_specks_are_left_out():

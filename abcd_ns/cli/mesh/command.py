@@ -19,8 +19,6 @@ from abcd_ns.cli.paths import find_run
 from abcd_ns.cli.report.run_folder import pipeline_config
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
-from abcd_ns.engine.layers.surface import median_depth
-from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -33,7 +31,6 @@ from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.views import training_views
-from abcd_ns.progress_bar import ProgressBar
 from abcd_ns.run import STORE
 from abcd_ns.run.fit import FREE_SHARE, RamShares
 from abcd_ns.run.store import MadeFor
@@ -81,7 +78,7 @@ def mesh(
     to = to_data(run) if frame == "data" else STAY
     keep = partial(_within, box, to) if box else lambda piece: piece
     with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:
-        maps = _draw(*_seen(store, pipeline_config(run, data)), depth == "median", folder)
+        maps = DepthMaps(Path(folder), *_seen(store, pipeline_config(run, data)), depth == "median")
         surface, side = _fuse(maps, voxel and voxel / to.scale, keep)
         if not len(surface.faces):
             raise UserError("There is no surface" + (" in this box." if box else " that three views see."))
@@ -114,29 +111,15 @@ def _within(box: Box, to: Frame, piece: Piece) -> Piece:
     return with_faces(piece, inside(box, middles).numpy())
 
 
-def _draw(
-    renderer: LayerRenderer, settings: RenderSettings, views: list[View], median: bool, folder: str
-) -> DepthMaps:
-    """What the views see, kept in the folder."""
-    maps = DepthMaps(Path(folder))
-    depth = partial(median_depth, renderer, settings=settings) if median else None
-    with ProgressBar("drawing", len(views)) as bar:
-        maps.draw(WholePictures(renderer, settings), views, bar.advance, depth)
-    return maps
-
-
 def _fuse(maps: DepthMaps, voxel: float | None, keep: Callable[[Piece], Piece]) -> tuple[Piece, float]:
     """The surface, as far as it is kept, and the side of its voxels, in world units of the run."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
-    footprints, count = maps.footprints(), len(maps.views)
+    footprints = maps.footprints()
     if not len(footprints):
         raise UserError("There is no surface: what the training views show is too transparent.")
     side = voxel or VOXEL_PIXELS * float(np.median(footprints))
-    with ProgressBar("looking for surfaces", count) as bar:
-        fusion = Fusion(maps, side, bar.advance)
-    with ProgressBar("fusing", fusion.parts * count) as bar:
-        surface = weld([keep(piece) for piece in fusion.pieces(bar.advance)])
+    surface = weld([keep(piece) for piece in Fusion(maps, side).pieces()])
     if (far := float((footprints > FAR * side).mean())) > MANY:
         print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
     return surface, side

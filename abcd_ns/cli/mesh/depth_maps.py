@@ -1,16 +1,16 @@
 """What each training view sees of a scene, depth and colour, drawn once and kept on disk."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.types import View
+from abcd_ns.progress_bar import tracked
 
 LEAST_OPACITY = 0.5
 """Of a pixel whose depth counts."""
@@ -18,39 +18,35 @@ SAMPLES = 1000
 """Pixels of a view by which footprints are known."""
 
 
-@dataclass
 class DepthMaps:
-    """Of some views, in files of `folder`: 7 bytes a pixel."""
+    """What some views see, in files of `folder`: 7 bytes a pixel. As many are drawn at once as have room.
 
-    folder: Path
-    views: list[View] = field(default_factory=list)
+    Args:
+        median: take the median depth, not the expected one.
+    """
 
-    def draw(
+    def __init__(
         self,
-        pictures: WholePictures,
+        folder: Path,
+        renderer: LayerRenderer,
+        settings: RenderSettings,
         views: Sequence[View],
-        advance: Callable[[], None],
-        median: Callable[[View], Float[Tensor, "h w"]] | None = None,
+        median: bool = False,
     ) -> None:
-        """Draw and keep what the views see, as many at a time as there is room for.
-
-        Kept are camera z, world units, 0 where a view shows too little; and colours.
-
-        Args:
-            median: draws a view's median depth, to be taken in the expected one's place.
-        """
-        for view, picture in zip(views, pictures.draw(views), strict=True):
-            number, opacity = len(self.views), 1 - picture.transmittance
-            depth = median(view) if median else picture.depth / opacity.clamp_min(1e-6)
+        self.views, self._folder = views, folder
+        seen = zip(views, WholePictures(renderer, settings).draw(views), strict=True)
+        for number, (view, picture) in enumerate(tracked(seen, "drawing", len(views))):
+            opacity = 1 - picture.transmittance
+            expected = picture.depth / opacity.clamp_min(1e-6)
+            depth = median_depth(renderer, view, settings) if median else expected
             depth = torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
             color = (picture.color / opacity.clamp_min(LEAST_OPACITY)[..., None]).clamp(0, 1)
             np.save(self._file("depth", number), depth.float().cpu().numpy())
             np.save(self._file("color", number), (color * 255).round().to(torch.uint8).cpu().numpy())
-            self.views.append(view)
-            advance()
 
     def depth(self, number: int) -> np.ndarray:
-        """float32 [h, w] of the view at this place of `views`."""
+        """Camera z, world units, float32 [h, w], of the view at this place of `views`; 0 where it shows too
+        little."""
         return np.load(self._file("depth", number))
 
     def color(self, number: int) -> np.ndarray:
@@ -67,4 +63,4 @@ class DepthMaps:
         return np.concatenate(found)
 
     def _file(self, what: str, number: int) -> Path:
-        return self.folder / f"{what}-{number:06d}.npy"
+        return self._folder / f"{what}-{number:06d}.npy"

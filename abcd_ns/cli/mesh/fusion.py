@@ -6,7 +6,7 @@ the same in each part that has it, and so are the vertices between voxels. Each 
 whose box it begins in: together the parts are, bit for bit, the surface that is fused at once.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.cli.mesh.surface import Piece, with_faces
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
+from abcd_ns.progress_bar import ProgressBar, tracked
 
 BOX = 16
 """Side of a box, voxels."""
@@ -41,42 +42,39 @@ class Fusion:
 
     Args:
         voxel: their side, world units.
-        advance: called for each view that was looked at.
         part_boxes: of a part, about, those around it left out.
     """
 
-    def __init__(
-        self, maps: DepthMaps, voxel: float, advance: Callable[[], None], part_boxes: int = PART_BOXES
-    ) -> None:
+    def __init__(self, maps: DepthMaps, voxel: float, part_boxes: int = PART_BOXES) -> None:
         self._maps, self._voxel, self._seen = maps, voxel, list[np.ndarray]()
         grid, none = self._grid(1), np.zeros((0, 3), np.int32)
-        for number, view in enumerate(maps.views):
+        for number, view in enumerate(tracked(maps.views, "looking for surfaces")):
             depth, found = maps.depth(number), none
             sampled = depth[::STRIDE, ::STRIDE]
             if ((sampled > 0) & (sampled < self._farthest(view))).any():
                 boxes = grid.compute_unique_block_coordinates(_image(depth), *self._optics(view))
                 found = np.unique(boxes.numpy(), axis=0)
             self._seen.append(found)
-            advance()
         self._boxes = np.unique(np.concatenate([none, *self._seen]), axis=0)
         self.parts = max(1, -(-len(self._boxes) // part_boxes))
         """In how many parts space is fused."""
         self._tree = build_kd(self._centers(self._boxes), self.parts)
 
-    def pieces(self, advance: Callable[[], None]) -> Iterator[Piece]:
-        """The surface, part by part; `advance` is called for each view of each part."""
-        for part in range(self.parts):
-            # A quarter of a box more, so that no rounding leaves out a neighbour.
-            around = self._tree.cell(part).grown(1.25 * BOX * self._voxel)
-            count = int(around.contains(self._centers(self._boxes)).sum())
-            grid = self._grid(max(count, 1))
-            for number, view in enumerate(self._maps.views):
-                boxes = self._seen[number][around.contains(self._centers(self._seen[number])).numpy()]
-                if len(boxes):
-                    self._integrate(grid, number, view, boxes)
-                advance()
-            if count:
-                yield self._own(part, grid.extract_triangle_mesh(LEAST_VIEWS - 0.5))
+    def pieces(self) -> Iterator[Piece]:
+        """The surface, part by part."""
+        with ProgressBar("fusing", self.parts * len(self._maps.views)) as bar:
+            for part in range(self.parts):
+                # A quarter of a box more, so that no rounding leaves out a neighbour.
+                around = self._tree.cell(part).grown(1.25 * BOX * self._voxel)
+                count = int(around.contains(self._centers(self._boxes)).sum())
+                grid = self._grid(max(count, 1))
+                for number, view in enumerate(self._maps.views):
+                    boxes = self._seen[number][around.contains(self._centers(self._seen[number])).numpy()]
+                    if len(boxes):
+                        self._integrate(grid, number, view, boxes)
+                    bar.advance()
+                if count:
+                    yield self._own(part, grid.extract_triangle_mesh(LEAST_VIEWS - 0.5))
 
     def _integrate(self, grid: Any, number: int, view: View, boxes: np.ndarray) -> None:
         color = self._maps.color(number).astype(np.float32) / 255
