@@ -17,6 +17,7 @@ from abcd_ns.cli.train import tool
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.lab.runs.runner import take_folder, taking
+from abcd_ns.lab.world.table_scene import LAST, draw_table
 from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.run import STATE
@@ -92,9 +93,6 @@ def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[st
 
 def _draw_scene(scene: Path) -> None:
     """Draw it, unless an earlier demo has."""
-    # Here and not above: torch takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.lab.world.table_scene import LAST, draw_table
-
     if not (scene / LAST).exists():
         with taking(scene):
             draw_table(scene, **SCENE)

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
+from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.budgets import ALONE, JOINT, WITHIN, draw_budgets, shares_of, within_budgets
 from abcd_ns.lab.compare.charts import draw_charts
@@ -31,6 +32,7 @@ from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
+from abcd_ns.lab.runs.configs import check_options, check_scene, registered
 from abcd_ns.lab.runs.options import Flag, check_numbers, check_ranges, parse_changes, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
@@ -145,9 +147,6 @@ def compare(
     options = options.over(read_options(config)) if config else options
     plan = make_plan(options)
     if plan.kind != TERRAIN:
-        # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
-        from abcd_ns.lab.runs.configs import check_options, check_scene
-
         for job in plan.jobs:
             check_options(job)
         check_scene(plan.jobs[0])
@@ -248,12 +247,7 @@ def arms_of(given: Options) -> list[tuple[str, ...]]:
     """What each arm changes: every number of blocks, if there are several, with nothing and with each of
     --vary. A UserError where an option does not exist, or a value does not fit."""
     check_numbers("--blocks", given.blocks, 1)
-    changes: list[tuple[str, ...]] = []
-    if given.vary:
-        # Here and not above: `--help` has no use for nerfstudio.
-        from abcd_ns.lab.runs.configs import registered
-
-        changes = [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
+    changes = [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
     of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]
     if twice := [one for one in changes if changes.count(one) > 1] + of_blocks:
@@ -293,9 +287,6 @@ def _check_methods(given: Options) -> None:
 
 
 def _settings(given: Options) -> Settings:
-    # Here and not above: torch takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.engine.space.partition import MAX_BLOCKS
-
     if given.data is None:
         raise UserError("Give the scene with --data FOLDER.")
     if not Path(given.data).exists():

@@ -11,6 +11,7 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
+from abcd_ns.engine.render.loss import decibels
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import in_style
 
@@ -21,21 +22,9 @@ COLUMN_INCHES = 2.6
 PictureArray = NDArray[np.uint8]
 
 
-def read_picture(path: Path) -> PictureArray:
-    """uint8 [h, w, 3]."""
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
-
-
 def error_map(picture: PictureArray, photo: PictureArray) -> NDArray[np.float32]:
     """|picture - photo|, mean over the colour channels: [h, w] in 0..1."""
     return np.abs(picture.astype(np.float32) - photo.astype(np.float32)).mean(axis=2) / 255
-
-
-def psnr_of(picture: PictureArray, photo: PictureArray) -> float:
-    """Of 8-bit pictures, dB; infinite where both are equal."""
-    squared = np.mean((picture.astype(np.float64) - photo.astype(np.float64)) ** 2) / 255**2
-    return float("inf") if squared == 0 else float(-10 * np.log10(squared))
 
 
 @in_style
@@ -53,7 +42,8 @@ def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], titl
     figure.suptitle(title, fontsize=9)
     _show(grid[0, 0], photo, "photo")
     for column, (name, picture) in enumerate(pictures.items(), start=1):
-        _show(grid[0, column], picture, f"{name}  {psnr_of(picture, photo):.2f} dB")
+        psnr = decibels(np.mean((picture.astype(np.float64) - photo) ** 2) / 255**2)
+        _show(grid[0, column], picture, f"{name}  {psnr:.2f} dB")
         map_of_errors = error_map(picture, photo)
         below = f"error of {name}, mean {map_of_errors.mean():.1%}"
         error = _show(grid[1, column], map_of_errors, below, cmap=ERROR_COLORS, vmin=0, vmax=1 / ERROR_GAIN)
@@ -87,9 +77,14 @@ def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
     seeds = ", ".join(map(str, sorted({run.seed for run, _ in runs})))
     for found in sorted(folder.glob("photo-*.png")):
         row = int(found.stem.removeprefix("photo-"))
-        pictures = {run.method: read_picture(path / f"merged-{row:04d}.png") for run, path in runs}
+        pictures = {run.method: _read(path / f"merged-{row:04d}.png") for run, path in runs}
         name = next(view.name for view in first.views if view.row == row)
         paths.append(out / f"view-{row:04d}.png")
         title = f"{first.scene}, held-out view {name}, merged, seed {seeds}"
-        draw_comparison(read_picture(found), pictures, title, paths[-1])
+        draw_comparison(_read(found), pictures, title, paths[-1])
     return paths
+
+
+def _read(path: Path) -> PictureArray:
+    with Image.open(path) as image:
+        return np.asarray(image)

@@ -1,16 +1,16 @@
 """Held-out views, drawn and scored without leaving a trace in the training that goes on around it."""
 
-import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
-from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.render.loss import decibels, psnr
 from abcd_ns.engine.types import Layer
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.nerfstudio.metrics import counted, image_metrics
@@ -86,17 +86,14 @@ def ordering_gap(squared_gaps: Sequence[float], blocks: int) -> tuple[float | No
     """
     if blocks == 1:
         return None, "one block: merged and composited are the same picture"
-    mean = sum(squared_gaps) / len(squared_gaps)
-    if mean == 0:
-        return None, "merged and composited pictures are equal to the last bit"
-    return -10 * math.log10(mean), None
+    if any(squared_gaps):
+        return decibels(fmean(squared_gaps)), None
+    return None, "merged and composited pictures are equal to the last bit"
 
 
 def mean(values: Sequence[float | None]) -> float | None:
     """The mean, or None if any value is missing."""
-    if not values or any(value is None for value in values):
-        return None
-    return sum(values) / len(values)
+    return None if not values or None in values else fmean(values)
 
 
 @contextmanager

@@ -219,17 +219,12 @@ def run_job(job: Job, out: Path) -> Run | Failure:
     return run or Failure(job.method, job.seed, _reason(code, log), str(log.relative_to(out)), job.variant)
 
 
-def last_line(log: Path) -> str:
-    """The last line with anything in it, or ""."""
-    lines = log.read_text("utf-8", "replace").splitlines()
-    return next((line.strip() for line in reversed(lines) if line.strip()), "")
-
-
 def _reason(code: int, log: Path) -> str:
     if code < 0:
         hint = " (out of memory?)" if code == -signal.SIGKILL else ""
         return f"ended by {signal.Signals(-code).name}{hint}"
-    return last_line(log) or f"exit code {code}"
+    lines = log.read_text("utf-8", "replace").splitlines()
+    return next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
 
 
 def _short(outcome: Run | Failure) -> str:

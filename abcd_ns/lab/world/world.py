@@ -99,11 +99,9 @@ class World(ABC):
             bands.append(F.avg_pool2d(band.reshape(height, larger.width, 3).permute(2, 0, 1), fine))
         return torch.cat(bands, dim=1).permute(1, 2, 0).float().contiguous()
 
-    def points(
-        self, views: list[View], count: int, seed: int = 0
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    def points(self, views: list[View], count: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
         """About `count` points on what the views see, as a reconstruction would give, and colours 0..255."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         places, colors = [], []
         for view in views:
             where, hit, color = self.first(view)
@@ -150,13 +148,6 @@ class Surfaces(World):
         return (base + 0.12 * waves).clamp(0.02, 0.98)
 
 
-def project(view: View, places: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Pixel positions of places, and their camera z."""
-    at = places @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    z = torch.where(at[:, 2].abs() > 1e-9, at[:, 2], 1e-9)
-    return at[:, :2] / z[:, None] * view.K.diagonal()[:2] + view.K[:2, 2], at[:, 2]
-
-
 def look_at(eye: Tensor, target: Tensor) -> Float[Tensor, "4 4"]:
     """World to camera, OpenCV convention, with the world's z up."""
     forward = F.normalize(target - eye, dim=0)
@@ -171,15 +162,14 @@ def camera(
     eye: Sequence[float],
     target: Sequence[float],
     index: int,
-    size: tuple[int, int] = (48, 36),
+    size: tuple[int, int],
     focal: float = 1.0,
-    dtype: torch.dtype = torch.float32,
 ) -> View:
     """A camera at `eye` that looks at `target`; `focal` is its focal length in widths of the picture."""
     (width, height), f = size, focal * size[0]
-    K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]], dtype=dtype)
+    K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
     pose = look_at(torch.tensor(eye, dtype=torch.float64), torch.tensor(target, dtype=torch.float64))
-    return View(pose.to(dtype), K, width, height, index)
+    return View(pose.float(), K, width, height, index)
 
 
 def ring(count: int, *, turn: float = 0.0, size: tuple[int, int] = (48, 36)) -> list[View]:
