@@ -7,12 +7,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from nerfstudio.cameras.cameras import Cameras
 
 from abcd_ns.cli.report.run_folder import Checkpoint
 from abcd_ns.cli.report.story import Story
-from abcd_ns.lab.results.style import COLORS, in_style, lay_grid, short
+from abcd_ns.lab.results.style import COLORS, in_style, lay_grid
 from abcd_ns.nerfstudio.run.log_lines import SampleLine, TrainingLine
 from abcd_ns.units import GIB
 from abcd_ns.viewer.images import data_uri
@@ -75,15 +75,15 @@ def draw_progress(story: Story) -> str | None:
             axes.plot([line.seconds for line in samples], values, color=color, label=name)
         axes.legend(frameon=False, loc="lower right")
         axes.set_ylim(bottom=0)
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+        if what == "Gaussians":
+            axes.yaxis.set_major_formatter(EngFormatter(sep=""))
     return _uri(figure)
 
 
 def _draw_visits(axes: Axes, story: Story) -> None:
     """Which block was trained when; each visit begins with drawing its layers. The warm-up is shaded."""
     _over_time(axes, story, "block").grid(visible=False)
-    first = story.visits[0]
-    if first.block is None:
+    if (first := story.visits[0]).block is None:
         ends = first.seconds - first.visit_seconds, first.seconds
         axes.axvspan(*ends, color=STEPS, alpha=0.3, linewidth=0, label="warm-up")
     visits = [visit for visit in story.visits if visit.block is not None]

@@ -15,16 +15,7 @@ from rich.console import Console
 
 from abcd_ns import __version__
 from abcd_ns.cli.paths import check_file, find_run
-from abcd_ns.cli.report import charts
-from abcd_ns.cli.report.figures import (
-    BLOCK_TITLES,
-    as_text,
-    block_rows,
-    changed_options,
-    more_figures,
-    tiles,
-    training_command,
-)
+from abcd_ns.cli.report import charts, figures
 from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
 from abcd_ns.cli.report.story import Story
@@ -136,7 +127,7 @@ def render_page(
         script_hash="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         settings=settings,
         unfinished=_unfinished(story),
-        tiles=tiles(run, held_out),
+        tiles=figures.tiles(run, held_out),
         notes=[without_home(note) for note in notes],
         quality=charts.draw_quality(story, psnr and (checkpoint.step, psnr), settings.method),
         progress=charts.draw_progress(story),
@@ -145,12 +136,12 @@ def render_page(
         held_out=held_out,
         error_limit=f"{100 / ERROR_GAIN:g}%",
         map=charts.draw_map(checkpoint, cameras) if checkpoint and len(checkpoint.means) else None,
-        figures=more_figures(run, held_out).items(),
-        block_titles=BLOCK_TITLES,
-        blocks=block_rows(run),
-        changed=changed_options(settings),
-        options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
-        command=without_home(training_command(settings)),
+        figures=figures.more_figures(run, held_out).items(),
+        block_titles=figures.BLOCK_TITLES,
+        blocks=figures.block_rows(run),
+        changed=figures.changed_options(settings),
+        options=[(name, figures.as_text(value)) for name, value in sorted(settings.options.items())],
+        command=without_home(figures.training_command(settings)),
         versions=[(name, value or NOTHING) for name, value in versions.items()],
     )
 

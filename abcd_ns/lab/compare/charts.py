@@ -7,10 +7,11 @@ from statistics import fmean
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from abcd_ns.lab.results.results import Arm, Results
 from abcd_ns.lab.results.run import CurvePoint, Run
-from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, lay_grid, save, short
+from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, lay_grid, save
 from abcd_ns.units import MIB
 
 Along = Callable[[CurvePoint], float]
@@ -34,7 +35,7 @@ def draw_charts(results: Results, out: Path, prefix: str = "") -> list[Path]:
     return [*paths, save(_draw_memory(results), out, f"{prefix}memory")]
 
 
-def mean_curve(runs: Sequence[Run], along: Along = lambda point: point.seconds) -> list[tuple[float, float]]:
+def mean_curve(runs: Sequence[Run], along: Along) -> list[tuple[float, float]]:
     """(x, PSNR) at each moment, means over the seeds.
 
     Runs that passed a moment within one step lack its point; the curve then begins where the shortest does,
@@ -69,7 +70,7 @@ def _draw_curves(results: Results, along: Along, x_label: str) -> Figure:
         axes.plot(*zip(*curve, strict=True), color=color, marker=MARKERS[arm.method], label=label)
     axes.set(xlabel=x_label, ylabel="held-out PSNR (dB)", xlim=(0, None))
     if x_label.startswith("Gaussians"):
-        axes.xaxis.set_major_formatter(lambda value, _: short(value))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.legend(loc="outside right center")
     return figure
 
@@ -101,6 +102,6 @@ def _draw_memory(results: Results) -> Figure:
     if bases := [run.memory.base_rss_bytes / MIB for run in results.runs if run.memory is not None]:
         axes.axhline(min(bases), color="#888888", linewidth=0.8, linestyle=":", label="RAM before any scene")
     axes.set(xlabel="Gaussians in the scene at the end", ylabel="peak memory (MiB)", ylim=(0, None))
-    axes.xaxis.set_major_formatter(lambda value, _: short(value))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.legend(loc="outside right center")
     return figure

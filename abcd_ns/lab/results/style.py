@@ -53,10 +53,3 @@ def lay_grid(axes: Axes) -> None:
     """Pale lines behind everything."""
     axes.grid(color="#d9d9d9", linewidth=0.5)
     axes.set_axisbelow(True)
-
-
-def short(count: float) -> str:
-    """32000 as 32k."""
-    if count >= 1e6:
-        return f"{count / 1e6:.3g}M"
-    return f"{count / 1e3:.3g}k" if count >= 1000 else f"{count:g}"
