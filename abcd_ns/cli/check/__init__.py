@@ -1,1 +1,1 @@
-"""`abcd check`: `survey` reads all there is, `rules` find fault with it."""
+"""`abcd check`: `survey` reads all there is, `command` finds fault with it."""

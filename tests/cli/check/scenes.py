@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from abcd_ns.cli.check.rules import doubts
+from abcd_ns.cli.check.command import doubts
 from abcd_ns.cli.check.survey import Look, Survey, visibility
 from abcd_ns.cli.findings import Finding
 from tests.data.dataparser_scenes import write_model, write_photos

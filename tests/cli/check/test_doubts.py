@@ -52,7 +52,7 @@ def test_exposure_that_varies_is_told_from_blank_photos(found, monkeypatch):
     blank = with_brightness(found, 0.0, 0.999, *evenly[2:])
     assert "2 black or white" in the("blank-photos", blank).what
     assert "exposure" not in names(blank)
-    monkeypatch.setattr("abcd_ns.cli.check.rules.default_budget", lambda: 1000)
+    monkeypatch.setattr("abcd_ns.cli.check.command.default_budget", lambda: 1000)
     assert "photo-cache-gb" in the("photos-beyond-ram", found).fix
 
 
