@@ -121,10 +121,8 @@ def main(args: Sequence[str] | None = None) -> int:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         if error.filename is None and not is_full:
             raise
-        message = (
-            f"{error.filename or 'The output'} cannot be {'written' if is_full else 'used'}: {error.strerror}"
-        )
-        message += "; free some space." if is_full else "."
+        message = f"{error.filename or 'The output'} cannot be "
+        message += f"written: {error.strerror}; free some space." if is_full else f"used: {error.strerror}."
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     from rich.console import Console  # `abcd --help` has no use for it

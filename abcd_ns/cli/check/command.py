@@ -20,8 +20,6 @@ from abcd_ns.engine.train.memory import parameter_bytes
 from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.units import bytes_in_words
 
-REFUSED = 2
-"""Exit code where training would refuse the data."""
 MIDDLE = (0.05, 0.95)
 """Quantiles between which the points' extent is taken: single wrong ones would decide it otherwise."""
 FEW_PHOTOS, FEW_POINTS, FEW_POINTS_IN_VIEW = 8, 500, 20
@@ -66,7 +64,7 @@ def check(*, data: Path, downscale: int | None = None) -> int:
     else:
         verdict = f"{name} is fine: ns-train abcd --data {shlex.quote(name)}{reduced}"
     print_plain(f"\n{verdict}", console)
-    return REFUSED if "error" in levels else 0
+    return 2 if "error" in levels else 0
 
 
 def examine(data: Path, downscale: int | None = None) -> tuple[Survey | None, tuple[Finding, ...]]:

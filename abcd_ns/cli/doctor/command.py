@@ -11,8 +11,6 @@ from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.machine import without_home
 from abcd_ns.units import GIB, bytes_in_words
 
-CANNOT_TRAIN = 1
-"""Exit code where something makes training impossible."""
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
 DETAILS = ("os", "driver", "torch_cuda", "lpips_missing")
@@ -49,7 +47,7 @@ def doctor(*, verbose: bool = False) -> int:
         notes = f" and {many(left, 'note', 'notes')}" if left else ""
         verdict += f" All versions{notes}: abcd doctor --verbose"
     console.print(f"\n{verdict}", highlight=False)
-    return CANNOT_TRAIN if ill else 0
+    return int(ill)
 
 
 def diagnose(facts: Facts) -> tuple[Finding, ...]:

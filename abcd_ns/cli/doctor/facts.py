@@ -59,7 +59,6 @@ class Facts:
     driver: str | None
     """Of an NVIDIA device, whether torch sees it or not."""
     cpu: str | None = None
-    """None where torch does not start."""
     cores: int = 0
     """That this process may use."""
     gpu: str | None = None
@@ -70,15 +69,13 @@ class Facts:
     folder: str | None = None
     """Of the CPU rasterizer's library; None where torch or abcd_ns do not start."""
     built: bool = False
-    """Whether that library is there."""
     gsplat: str | None = None
-    """gsplat's compiled extension."""
+    """Its compiled extension."""
     build_tools: dict[str, str | None] = field(default_factory=dict)
-    """What compiles gsplat's: the version of nvcc, where the others are; None where one is missing."""
+    """What compiles it: the version of nvcc, where the others are; None where one is missing."""
     difference: float | None = None
     """The largest relative one of the CPU rasterizer to the reference. Training checks gsplat's."""
     failed: str | None = None
-    """What is wrong with it."""
     lpips_missing: str | None = None
     """Why LPIPS cannot be computed, if so."""
 

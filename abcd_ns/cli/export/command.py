@@ -26,7 +26,6 @@ TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file with the transform from the data's frame to the run's."""
 LOST_DIGITS = 1e-4
 """Rounding errors above this share of the scene's size are printed."""
-FAR_AWAY = ": the data's origin is far away. --frame nerfstudio keeps all digits."
 
 
 def export(
@@ -147,5 +146,6 @@ def tell_rounding(suffix: str, largest: float, size: float) -> None:
     """
     off = rounding(suffix, largest)
     if size > 0 and off > LOST_DIGITS * size:
-        remedy = "; .sog and .ply are finer." if suffix == ".spz" else FAR_AWAY
+        far = ": the data's origin is far away. --frame nerfstudio keeps all digits."
+        remedy = "; .sog and .ply are finer." if suffix == ".spz" else far
         print(f"{suffix} rounds positions to {off:.1g}, {off / size:.1g} of the scene's size{remedy}")

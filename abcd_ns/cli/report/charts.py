@@ -45,7 +45,9 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
     if crops:
         points = np.array(crops).T
         axes.plot(*points, ".", color=QUIET, markersize=2.5, alpha=0.5)
-        axes.plot(*smoothed(points), color=QUIET, linewidth=1.2, label="training crops")
+        reach = max(int(len(crops) * SMOOTHED), 1)
+        smooth = [np.convolve(row, np.ones(reach) / reach, "valid") for row in points]
+        axes.plot(*smooth, color=QUIET, linewidth=1.2, label="training crops")
     if scored:
         style = {"color": COLORS.get(method, STEPS), "clip_on": False, "label": "held-out views"}
         axes.plot(*zip(*sorted(scored.values()), strict=True), "o-", **style)
@@ -125,12 +127,6 @@ def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
             axes.plot(*found[:, plane].T, ".", color=color, markersize=4)
         axes.set(aspect="equal", xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], xlim=frame[0], ylim=frame[1])
     return _uri(figure)
-
-
-def smoothed(points: np.ndarray) -> np.ndarray:
-    """Running means of points [2, n] over SMOOTHED of them."""
-    reach = max(int(points.shape[1] * SMOOTHED), 1)
-    return np.stack([np.convolve(row, np.ones(reach) / reach, "valid") for row in points])
 
 
 def _over_time(axes: Axes, story: Story, what: str) -> Axes:

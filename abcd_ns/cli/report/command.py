@@ -18,7 +18,6 @@ from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.cli.report import charts, figures
 from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
-from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
@@ -59,7 +58,9 @@ def report(
     check_ranges({"pictures": pictures})
     folder = find_run(run, SETTINGS_FILE)
     out = out or folder / "report.html"
-    _check_page(out)
+    check_file("--out", out)
+    if out.exists() and f'content="{GENERATOR} '.encode() not in out.read_bytes()[:2048]:
+        raise UserError(f"--out {out} is no page of this command; name another file.")
     console, found = Console(), open_run(folder)
     held_out, cameras, notes = None, [], _notes(found, data)
     if data is not None and found.checkpoint is not None:
@@ -76,13 +77,6 @@ def report(
         print_plain(note, console, "yellow")
     print_plain(f"{out} ({out.stat().st_size / 2**20:.1f} MiB)", console)
     return 0
-
-
-def _check_page(out: Path) -> None:
-    """Whether the page may be written there: over nothing, or an earlier page of this command."""
-    check_file("--out", out)
-    if out.exists() and f'content="{GENERATOR} '.encode() not in out.read_bytes()[:2048]:
-        raise UserError(f"--out {out} is no page of this command; name another file.")
 
 
 def _notes(run: RunFolder, data: Path | None) -> list[str]:
@@ -114,6 +108,8 @@ def render_page(
         notes: what the reader must know first.
     """
     settings, story, checkpoint = run.settings, run.story, run.checkpoint
+    unfinished = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]
+    unfinished += [] if story.last(EndLine) else ["not ended: still running, or interrupted"]
     psnr = held_out and held_out.mean("psnr_merged")
     views = held_out.shown if held_out else ()
     versions = vars(settings.versions) | {"machine": about_machine(settings.machine)}
@@ -126,7 +122,7 @@ def render_page(
         # As a Content-Security-Policy names the one script that may run.
         script_hash="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         settings=settings,
-        unfinished=_unfinished(story),
+        unfinished=unfinished,
         tiles=figures.tiles(run, held_out),
         notes=[without_home(note) for note in notes],
         quality=charts.draw_quality(story, psnr and (checkpoint.step, psnr), settings.method),
@@ -144,8 +140,3 @@ def render_page(
         command=without_home(figures.training_command(settings)),
         versions=[(name, value or NOTHING) for name, value in versions.items()],
     )
-
-
-def _unfinished(story: Story) -> list[str]:
-    resumed = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]
-    return resumed if story.last(EndLine) else [*resumed, "not ended: still running, or interrupted"]

@@ -48,7 +48,8 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[Tile]:
         psnr, ssim = held_out.mean("psnr_merged"), held_out.mean("ssim_merged")
     else:  # the log's last
         psnr, ssim = (story.held_out[-1].psnr, story.held_out[-1].ssim) if story.held_out else (None, None)
-    layers = f", {story.layer_share:.0%} of the time for layers" if story.layer_share else ""
+    share = layer_share(story.visits)
+    layers = f", {share:.0%} of the time for layers" if share else ""
     taken = f"{story.end.seconds:.1f} s" if story.end.seconds < 100 else clock(story.end.seconds)
     ram, device = _peaks(run)
     of = f"of {machine.ram_bytes / GIB:.0f} GiB"

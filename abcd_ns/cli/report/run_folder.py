@@ -18,7 +18,7 @@ from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError, first_line
 from abcd_ns.lab.results.records import read_record
-from abcd_ns.lab.runs.configs import registered
+from abcd_ns.lab.runs.configs import REGISTERED
 from abcd_ns.lab.runs.options import set_options
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
@@ -132,7 +132,7 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
 
 def registered_config(settings: Settings) -> AbcdTrainerConfig:
     """The run's method and reader of data as this version has them; UserError where it has not."""
-    found = copy.deepcopy(registered(settings.method))
+    found = copy.deepcopy(REGISTERED.get(settings.method))
     if found is None:
         raise UserError(f"The run's method {settings.method!r} is none of this version of abcd_ns.")
     if settings.reader not in READERS:

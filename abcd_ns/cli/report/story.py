@@ -18,7 +18,6 @@ from abcd_ns.nerfstudio.run.log_lines import (
     TrainingLine,
     VisitEndLine,
     VisitLine,
-    layer_share,
 )
 
 L = TypeVar("L", bound=Line)
@@ -65,11 +64,6 @@ class Story:
         """In the whole scene, when last counted."""
         known = self.last(EndLine) or self.last(SampleLine) or self.last(TrainingLine)
         return known.gaussians
-
-    @property
-    def layer_share(self) -> float:
-        """Of the time of all visits that ended, the share for drawing layers."""
-        return layer_share(self.visits)
 
     def of_block(self, block: int) -> tuple[VisitEndLine, ...]:
         """The visits to one block that ended."""

@@ -32,7 +32,7 @@ from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
-from abcd_ns.lab.runs.configs import check_options, check_scene, registered
+from abcd_ns.lab.runs.configs import REGISTERED, check_options, check_scene
 from abcd_ns.lab.runs.options import Flag, check_numbers, check_ranges, parse_changes, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
@@ -247,7 +247,7 @@ def arms_of(given: Options) -> list[tuple[str, ...]]:
     """What each arm changes: every number of blocks, if there are several, with nothing and with each of
     --vary. A UserError where an option does not exist, or a value does not fit."""
     check_numbers("--blocks", given.blocks, 1)
-    changes = [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
+    changes = [parse_changes(text, REGISTERED["abcd"].pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
     of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]
     if twice := [one for one in changes if changes.count(one) > 1] + of_blocks:

@@ -24,12 +24,17 @@ from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
-_REGISTERED = {m: getattr(methods, m.replace("-", "_")).config for m in METHODS if m.startswith("abcd")}
+REGISTERED: dict[str, AbcdTrainerConfig] = {
+    method: getattr(methods, method.replace("-", "_")).config
+    for method in METHODS
+    if method.startswith("abcd")
+}
+"""What `ns-train` knows each method of ABCD's by. Not to be changed: copy it."""
 
 
 def trainer_config(job: Job, out: Path) -> TrainerConfig:
     """What the job trains with; its files go to `job.folder(out)`."""
-    config = _abcd(job) if job.method in _REGISTERED else _splatfacto(job)
+    config = _abcd(job) if job.method in REGISTERED else _splatfacto(job)
     settings = job.settings
     config.output_dir, config.experiment_name, config.timestamp = out, "runs", job.folder(out).name
     config.machine.seed = job.seed
@@ -58,13 +63,8 @@ def check_options(job: Job) -> None:
         raise UserError(f"{job.variant}: blocks must be 1 to {MAX_BLOCKS}, not {pipeline.blocks}.")
 
 
-def registered(method: str) -> AbcdTrainerConfig | None:
-    """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
-    return _REGISTERED.get(method)
-
-
 def _abcd(job: Job) -> AbcdTrainerConfig:
-    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method])
+    config: AbcdTrainerConfig = copy.deepcopy(REGISTERED[job.method])
     settings, pipeline = job.settings, config.pipeline
     pipeline.datamanager.data = Path(settings.data)
     pipeline.datamanager.dataparser = _parser(job)

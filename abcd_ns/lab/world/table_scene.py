@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from PIL import Image
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.lab.world.world import TABLE, Surfaces, ring
-from abcd_ns.progress_bar import ProgressBar
+from abcd_ns.progress_bar import tracked
 
 WORLD = Surfaces(tuple(replace(surface, fineness=4.0) for surface in TABLE.surfaces), seed=1, plain=0.9)
 MODEL = Path("sparse/0")
@@ -28,16 +27,14 @@ def draw_table(out: Path, count: int, size: tuple[int, int], points: int) -> Non
     views = ring(count, size=size)
     (out / "images").mkdir(parents=True, exist_ok=True)
     images = {}
-    with ProgressBar("Drawing", count, Console(stderr=True)) as bar:
-        for number, view in enumerate(views, 1):
-            name = f"view{number:03d}.png"
-            Image.fromarray((255 * WORLD.photo(view)).round().byte().numpy()).save(out / "images" / name)
-            turn = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
-            pose = turn[[3, 0, 1, 2]], view.viewmat[:3, 3].numpy()
-            images[number] = colmap.Image(number, *pose, 1, name, np.zeros((0, 2)), np.zeros(0, np.int64))
-            bar.advance()
-    found = (each.numpy() for each in WORLD.points(views, points))
     nobody = np.zeros(0, np.int64)
+    for number, view in enumerate(tracked(views, "Drawing"), 1):
+        name = f"view{number:03d}.png"
+        Image.fromarray((255 * WORLD.photo(view)).round().byte().numpy()).save(out / "images" / name)
+        turn = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
+        pose = turn[[3, 0, 1, 2]], view.viewmat[:3, 3].numpy()
+        images[number] = colmap.Image(number, *pose, 1, name, np.zeros((0, 2)), nobody)
+    found = (each.numpy() for each in WORLD.points(views, points))
     cloud = {
         number: colmap.Point3D(number, place, color.round().astype(np.uint8), 0.0, nobody, nobody)
         for number, (place, color) in enumerate(zip(*found, strict=True), 1)

@@ -13,7 +13,7 @@ from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.results.run import ViewScore
-from abcd_ns.lab.runs.configs import registered
+from abcd_ns.lab.runs.configs import REGISTERED
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import log_lines
 from abcd_ns.nerfstudio.run.log_lines import KINDS
@@ -65,7 +65,7 @@ def write_log(path: Path, lines: list[str]) -> Path:
 
 def made_up_settings(method: str = "abcd", **fields) -> Settings:
     """Settings at the method's defaults."""
-    config = copy.deepcopy(registered(method) or registered("abcd"))
+    config = copy.deepcopy(REGISTERED.get(method, REGISTERED["abcd"]))
     mirror(config.pipeline.training, config.pipeline.model)
     values = {
         "schema": SCHEMA,

@@ -17,6 +17,7 @@ from abcd_ns.cli import main as cli
 from abcd_ns.cli.report.command import report
 from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.run.log_lines import layer_share
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.nerfstudio.test_training import configure, run
@@ -81,7 +82,7 @@ def test_a_run_becomes_one_page_that_tells_what_terminal_and_log_tell(trained, c
     step, psnr, gaussians, share = re.search(summary, said).groups()
     assert f"{HELD_OUT} held out; photos of up to {WIDTH} x {HEIGHT} px." in said
     assert (step, psnr) == (f"{story.end.step}", f"{story.held_out[-1].psnr:.2f}")
-    assert (gaussians, share) == (f"{story.gaussians:,}", f"{story.layer_share:.0%}")
+    assert (gaussians, share) == (f"{story.gaussians:,}", f"{layer_share(story.visits):.0%}")
     for value in (f"{psnr} dB", f"{step} steps, {share} of the time for layers", gaussians):
         assert value in page
 

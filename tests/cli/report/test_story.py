@@ -7,7 +7,7 @@ import pytest
 from abcd_ns.cli.report.charts import draw_progress
 from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.lab.results.records import RecordError
-from abcd_ns.nerfstudio.run.log_lines import EndLine
+from abcd_ns.nerfstudio.run.log_lines import EndLine, layer_share
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
 
 
@@ -18,7 +18,7 @@ def story(tmp_path) -> Story:
 
 def test_a_log_tells_visits_and_totals(story):
     assert [visit.block for visit in story.visits] == [None, 0, 1, 2]
-    assert story.layer_share == 3 / 16
+    assert layer_share(story.visits) == 3 / 16
     assert [visit.psnr for visit in story.of_block(1)] == [22.0]
     assert (story.end.step, story.end.seconds, story.blocks, story.gaussians) == (40, 16.0, 3, 330)
     assert story.last(EndLine) is None
