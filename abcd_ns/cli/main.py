@@ -46,7 +46,7 @@ COMMANDS = (
     Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
     Command("poses", "abcd_ns.cli.poses:poses", "find the camera poses of photos, by pycolmap"),
     Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
-    Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
+    Command("plan", "abcd_ns.cli.plan:plan", "predict blocks, memory and time of a run"),
     Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", passes_on=True),
     Command("report", "abcd_ns.cli.report.command:report", "write an HTML page about a run"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),

@@ -12,8 +12,7 @@ import torch
 from rich.console import Console
 
 from abcd_ns.cli.check.command import check
-from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
-from abcd_ns.cli.plan.forecast import LOST, Forecast
+from abcd_ns.cli.plan import LOST, Capture, Forecast, Wanted, forecast, plan, print_forecast
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
