@@ -57,8 +57,7 @@ def demo(
     run = out / "training" / "demo" / "abcd" / time.strftime("%Y-%m-%d_%H%M%S")
     console, began = Console(), time.monotonic()
     steps = {"A scene: five balls on a table": partial(_draw_scene, out / "scene")}
-    titles = "Training", "Export for other viewers", "A page about the run"
-    for title, command in zip(titles, _commands(out, run, seconds, blocks), strict=True):
+    for title, command in _commands(out, run, seconds, blocks).items():
         steps[title] = partial(_run, command, out / "logs", console)
     for number, (title, step) in enumerate(steps.items(), 1):
         now = clock(time.monotonic() - began)
@@ -68,11 +67,11 @@ def demo(
     return 0
 
 
-def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[str]]:
-    """What is typed, one after the other."""
-    scene, never = out / "scene", ("max-num-iterations", "steps-per-save", "steps-per-eval-image")
+def _commands(out: Path, run: Path, seconds: float, blocks: int) -> dict[str, list[str]]:
+    """What is typed, one after the other, by what it does."""
+    never = "max-num-iterations", "steps-per-save", "steps-per-eval-image", "steps-per-eval-all-images"
     options = {
-        "data": scene.resolve(),
+        "data": (out / "scene").resolve(),
         "output-dir": run.parents[2],
         "experiment-name": run.parents[1].name,
         "timestamp": run.name,
@@ -80,15 +79,15 @@ def _commands(out: Path, run: Path, seconds: float, blocks: int) -> list[list[st
         "viewer.quit-on-train-completion": True,
         "pipeline.blocks": blocks,
         "pipeline.max-seconds": f"{seconds:g}",
-        **dict.fromkeys((*never, "steps-per-eval-all-images"), NEVER),
+        **dict.fromkeys(never, NEVER),
     }
     exported = {"load-config": run / "config.yml", "output-dir": out, "output-filename": "splat.ply"}
-    page = {"data": scene, "out": out / "report.html"}
-    return [
-        ["ns-train", "abcd", *_flags(options)],
-        ["ns-export", "gaussian-splat", *_flags(exported)],
-        ["abcd", "report", str(run), *_flags(page)],
-    ]
+    page = {"data": out / "scene", "out": out / "report.html"}
+    return {
+        "Training": ["ns-train", "abcd", *_flags(options)],
+        "Export for other viewers": ["ns-export", "gaussian-splat", *_flags(exported)],
+        "A page about the run": ["abcd", "report", str(run), *_flags(page)],
+    }
 
 
 def _draw_scene(scene: Path) -> None:

@@ -75,7 +75,7 @@ def draw_progress(story: Story) -> str | None:
         axes = _over_time(next(below), story, what)
         for (name, values), color in zip(curves.items(), (STEPS, LAYERS), strict=False):
             axes.plot([line.seconds for line in samples], values, color=color, label=name)
-        axes.legend(frameon=False, loc="lower right")
+        axes.legend(loc="lower right")
         axes.set_ylim(bottom=0)
         if what == "Gaussians":
             axes.yaxis.set_major_formatter(EngFormatter(sep=""))

@@ -11,7 +11,7 @@ from PIL import Image
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
 from abcd_ns.lab.results.run import ViewScore
-from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap
+from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, to_bytes
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.progress_bar import tracked
 from abcd_ns.viewer.images import data_uri
@@ -84,9 +84,7 @@ def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
 
 
 def _show(drawn: Drawn, score: ViewScore, place: str, count: int) -> Shown:
-    photo, picture = (
-        (image.clamp(0, 1) * 255).round().byte().cpu().numpy() for image in (drawn.photo, drawn.merged)
-    )
+    photo, picture = (to_bytes(image) for image in (drawn.photo, drawn.merged))
     amplified = np.clip(error_map(picture, photo) * ERROR_GAIN, 0, 1)
     error = matplotlib.colormaps[ERROR_COLORS](amplified, bytes=True)[..., :3]
     height, width = photo.shape[:2]

@@ -5,8 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import fmean
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
@@ -94,6 +95,11 @@ def ordering_gap(squared_gaps: Sequence[float], blocks: int) -> tuple[float | No
 def mean(values: Sequence[float | None]) -> float | None:
     """The mean, or None if any value is missing."""
     return None if not values or None in values else fmean(values)
+
+
+def to_bytes(picture: Picture) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture as files hold it."""
+    return (picture.clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 @contextmanager

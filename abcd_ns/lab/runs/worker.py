@@ -27,7 +27,7 @@ from abcd_ns.formats.scene_file import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap, to_bytes
 from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
@@ -228,8 +228,7 @@ def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[V
         if drawn.row in shown:
             pictures.mkdir(exist_ok=True)
             for kind in ("photo", "merged"):
-                picture = (getattr(drawn, kind) * 255).round().byte().cpu().numpy()
-                Image.fromarray(picture).save(pictures / f"{kind}-{drawn.row:04d}.png")
+                Image.fromarray(to_bytes(getattr(drawn, kind))).save(pictures / f"{kind}-{drawn.row:04d}.png")
     return scores, gaps
 
 
