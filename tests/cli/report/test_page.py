@@ -44,28 +44,25 @@ HOSTILE = "</title></style><script>alert(1)</script>\"'><img src=http://evil/x o
 
 
 class Page(HTMLParser):
-    """Elements, and the text in each kind of them."""
+    """Elements, and the text of those that hold nothing else."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.elements: list[tuple[str, dict[str, str]]] = []
-        self.texts: dict[str, list[str]] = {}
-        self._open: list[str] = []
+        self.texts: dict[str, list[str]] = {"": [""]}
+        self._tag = ""
         self.feed(text)
 
     def handle_starttag(self, tag, attrs) -> None:
         self.elements.append((tag, dict(attrs)))
         self.texts.setdefault(tag, []).append("")
-        self._open.append(tag)
+        self._tag = tag
 
-    def handle_endtag(self, tag) -> None:
-        if tag in self._open:
-            while self._open.pop() != tag:
-                pass
+    def handle_endtag(self, _) -> None:
+        self._tag = ""
 
     def handle_data(self, data) -> None:
-        for tag in set(self._open):
-            self.texts[tag][-1] += data
+        self.texts[self._tag][-1] += data
 
     def all(self, tag: str) -> list[dict[str, str]]:
         return [attributes for name, attributes in self.elements if name == tag]

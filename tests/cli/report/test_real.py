@@ -183,10 +183,6 @@ def test_a_run_that_is_still_going_on_has_a_page(copied):
         (lambda folder: (folder / "abcd" / SETTINGS_FILE).write_text("{"), r"settings\.json is not JSON"),
         (lambda folder: settings_changed(folder, begun="today"), r"settings\.json: .*begun"),
         (
-            lambda folder: (folder / "abcd" / LOG_FILE).write_text('{"kind": "magic"}\n'),
-            r"log\.jsonl, line 1 is of the unknown kind 'magic'",
-        ),
-        (
             lambda folder: next((folder / "nerfstudio_models").iterdir()).write_bytes(b""),
             r"\.ckpt cannot be read",
         ),

@@ -107,13 +107,6 @@ def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     assert [path.name for path in plan.out.iterdir()] == ["thesis.tex"]
 
 
-def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan):
-    inside = plan.out.parent / "scene.txt" / "out"
-    inside.parent.write_text("")
-    with pytest.raises(UserError, match=rf"^{inside} cannot be written: Not a directory; name"):
-        run(dataclasses.replace(plan, out=inside))
-
-
 def test_a_scene_that_cannot_be_read_is_refused_before_the_first_run(plan, worker, capsys):
     """It is a folder, but holds no model."""
     words = ["compare", "--data", plan.settings.data, "--out", str(plan.out), "--steps", "10"]
@@ -121,14 +114,6 @@ def test_a_scene_that_cannot_be_read_is_refused_before_the_first_run(plan, worke
     assert "holds no model" in " ".join(capsys.readouterr().err.split())
     assert not plan.out.exists()
     assert worker.calls() == []
-
-
-def test_a_wrong_name_on_the_command_line_is_one_line_and_nothing_is_written(plan, capsys):
-    words = ["compare", "--data", plan.settings.data, "--out", str(plan.out), "--steps", "5"]
-    assert cli.main([*words, "--vary", "training.batch=1", "trainin.warmup=0"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == ["error: There is no option 'trainin.warmup'; did you mean training.warmup?"]
-    assert not plan.out.exists()
 
 
 def test_a_change_that_failed_is_named_and_all_is_written(plan, worker):

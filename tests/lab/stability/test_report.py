@@ -44,12 +44,6 @@ def test_only_known_scenarios_are_chosen(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path, capsys):
-    (tmp_path / "thesis.tex").touch()
-    assert cli.main(["stability", "--out", str(tmp_path), "--only", "A11"]) == 2
-    assert "is not empty and holds no stability report" in " ".join(capsys.readouterr().err.split())
-
-
 def test_what_is_done_is_kept_when_the_rest_breaks_off(tmp_path, monkeypatch):
     def stop(_):
         raise KeyboardInterrupt
