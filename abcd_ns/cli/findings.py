@@ -1,7 +1,7 @@
 """What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do."""
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -37,14 +37,8 @@ class Finding:
 error, warning, note = (partial(Finding, level) for level in STYLES)
 
 
-def by_level(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """The most serious first, otherwise in their order."""
-    order = list(STYLES)
-    return tuple(sorted(findings, key=lambda finding: order.index(finding.level)))
-
-
 def print_findings(findings: Sequence[Finding], console: Console) -> None:
-    """In groups by level. Errors stand in one line each, as `ns-train` has them."""
+    """In groups by level, the most serious first. Errors stand in one line each, as `ns-train` has them."""
     for level, style in STYLES.items():
         group = [finding for finding in findings if finding.level == level]
         if group:

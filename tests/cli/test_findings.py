@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.cli.findings import Finding, by_level, print_findings
+from abcd_ns.cli.findings import Finding, print_findings
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
@@ -23,8 +23,7 @@ def printed(*findings: Finding, width: int = 80) -> list[str]:
 
 def test_groups_are_titled_and_long_ones_cut():
     name, long = "[red]a.png[/red] :smile:", [Finding("note", str(i), "Too.") for i in range(30)]
-    found = by_level([Finding("note", "n", name), Finding("error", "e", "Bad."), *long])
-    lines = printed(*found)
+    lines = printed(Finding("note", "n", name), Finding("error", "e", "Bad."), *long)
     assert lines[:5] == ["", "error", "  e: Bad.", "", "notes (31)"]
     assert lines[5] == f"  n: {name}"  # names of files are no markup
     assert lines[24:] == ["  18: Too.", "  ... and 11 more (31 in all)."]

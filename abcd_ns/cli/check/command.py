@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from abcd_ns.cli.check.survey import Survey, survey
-from abcd_ns.cli.findings import Finding, by_level, error, note, print_findings, warning
+from abcd_ns.cli.findings import Finding, error, note, print_findings, warning
 from abcd_ns.cli.terminal import few, print_facts, print_plain
 from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError, one_line
@@ -67,15 +67,15 @@ def check(*, data: Path, downscale: int | None = None) -> int:
     return 2 if "error" in levels else 0
 
 
-def examine(data: Path, downscale: int | None = None) -> tuple[Survey | None, tuple[Finding, ...]]:
-    """The scene, None where training would refuse it, and what was found, the most serious first."""
+def examine(data: Path, downscale: int | None = None) -> tuple[Survey | None, list[Finding]]:
+    """The scene, None where training would refuse it, and what was found."""
     try:
         found = survey(data, downscale)
     except InputError as refused:
-        return None, tuple(error("input", line) for line in refused.lines)
+        return None, [error("input", line) for line in refused.lines]
     own = [warning("input", said) for said in found.prepared.notes]
     own += [note("input", said) for said in found.prepared.chosen]
-    return found, by_level([*own, *doubts(found)])
+    return found, [*own, *doubts(found)]
 
 
 def summary(s: Survey) -> dict[str, str]:

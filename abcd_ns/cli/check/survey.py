@@ -24,13 +24,6 @@ MOST_POINTS = 20_000
 """Of more points, an evenly spaced choice is projected."""
 
 
-class QuietParser(AbcdDataParser):
-    """The reader of training, but for its notes: they are among the findings."""
-
-    def tell(self, note: str) -> None:
-        """Nothing."""
-
-
 @dataclass(frozen=True)
 class Look:
     """What one decoded photo shows."""
@@ -104,7 +97,8 @@ def survey(data: Path, downscale: int | None) -> Survey:
     Raises:
         InputError: training would refuse it; lists all that is wrong.
     """
-    parser = QuietParser(AbcdDataParserConfig(data=data, downscale_factor=downscale))
+    parser = AbcdDataParser(AbcdDataParserConfig(data=data, downscale_factor=downscale))
+    parser.tell = lambda _: None  # notes are among the findings
     prepared, outputs = parser.prepared(), parser.get_dataparser_outputs("train")
     check_masks(prepared.sources)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from rich.console import Console
 
 from abcd_ns.cli.doctor.facts import COMPILER, EXPORT, Facts, gather
-from abcd_ns.cli.findings import Finding, by_level, error, note, print_findings, warning
+from abcd_ns.cli.findings import Finding, error, note, print_findings, warning
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.machine import without_home
 from abcd_ns.units import GIB, bytes_in_words
@@ -50,10 +50,10 @@ def doctor(*, verbose: bool = False) -> int:
     return int(ill)
 
 
-def diagnose(facts: Facts) -> tuple[Finding, ...]:
-    """All that is wrong, the most serious first."""
+def diagnose(facts: Facts) -> list[Finding]:
+    """All that is wrong."""
     found = [*_of_packages(facts), *_of_the_machine(facts), *_of_kernels(facts)]
-    return by_level(replace(f, what=without_home(f.what), fix=without_home(f.fix)) for f in found)
+    return [replace(f, what=without_home(f.what), fix=without_home(f.fix)) for f in found]
 
 
 def _rows(f: Facts) -> dict[str, str]:

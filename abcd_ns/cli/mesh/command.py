@@ -1,8 +1,6 @@
 """`abcd mesh`: a trained scene's surface as a mesh of triangles."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
@@ -76,10 +74,9 @@ def mesh(
     _check(out, voxel, box)
     run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
-    keep = partial(_within, box, to) if box else lambda piece: piece
     with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:
         maps = DepthMaps(Path(folder), *_seen(store, pipeline_config(run, data)), depth == "median")
-        surface, side = _fuse(maps, voxel and voxel / to.scale, keep)
+        surface, side = _fuse(maps, voxel and voxel / to.scale, box, to)
         if not len(surface.faces):
             raise UserError("There is no surface" + (" in this box." if box else " that three views see."))
         surface = without_specks(surface)
@@ -105,21 +102,23 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
         raise UserError(f"open3d, which fuses depths, is not there ({error}); see `abcd doctor`.") from None
 
 
-def _within(box: Box, to: Frame, piece: Piece) -> Piece:
-    """The faces whose middles are in the box, which is in the frame `to`."""
+def _within(box: Box | None, to: Frame, piece: Piece) -> Piece:
+    """The faces whose middles are in the box, if there is one, in the frame `to`."""
+    if box is None:
+        return piece
     middles = to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
     return with_faces(piece, inside(box, middles).numpy())
 
 
-def _fuse(maps: DepthMaps, voxel: float | None, keep: Callable[[Piece], Piece]) -> tuple[Piece, float]:
-    """The surface, as far as it is kept, and the side of its voxels, in world units of the run."""
+def _fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> tuple[Piece, float]:
+    """The surface within the box, and the side of its voxels, in world units of the run."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
     footprints = maps.footprints()
     if not len(footprints):
         raise UserError("There is no surface: what the training views show is too transparent.")
     side = voxel or VOXEL_PIXELS * float(np.median(footprints))
-    surface = weld([keep(piece) for piece in Fusion(maps, side).pieces()])
+    surface = weld([_within(box, to, piece) for piece in Fusion(maps, side).pieces()])
     if (far := float((footprints > FAR * side).mean())) > MANY:
         print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
     return surface, side

@@ -27,8 +27,6 @@ from abcd_ns.viewer.texts import clock
 
 BLOCK_TITLES = ("block", "Gaussians", "pruned", "views", "visits", "time", "layers", "PSNR", "state")
 """Columns of `block_rows`. PSNR is that of training crops, after the first visit and after the last."""
-Tile = tuple[str, str, str]
-"""A name, its value, and a line of small print."""
 READER = "pipeline.datamanager.dataparser."
 OF_THE_PLACE = {
     *("data", "experiment_name", "load_checkpoint", "load_config", "load_dir", "load_step", "output_dir"),
@@ -41,8 +39,8 @@ NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
 """Prefixes of what is no option of `ns-train`: the method sets it, or the device's memory."""
 
 
-def tiles(run: RunFolder, held_out: HeldOut | None) -> list[Tile]:
-    """The four most important numbers of a run."""
+def tiles(run: RunFolder, held_out: HeldOut | None) -> list[tuple[str, str, str]]:
+    """The four most important numbers of a run: name, value, and a line of small print."""
     story, limit, machine = run.story, run.story.last(TrainingLine).limit, run.settings.machine
     if held_out is not None:
         psnr, ssim = held_out.mean("psnr_merged"), held_out.mean("ssim_merged")

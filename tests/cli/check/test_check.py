@@ -37,7 +37,7 @@ def test_a_sound_scene_is_summed_up(sound, found, capsys):
     assert sorted(sound.rglob("*")) == before
 
     printed = capsys.readouterr().out
-    assert examine(sound)[1] == ()
+    assert examine(sound)[1] == []
     assert found.photo_bytes == sum(5 * 3 * w * h for w, h in SIZES)
     # Half the depth of the nearest point in a picture that is trained on.
     near = min(depths_in_training(found)) / 2
