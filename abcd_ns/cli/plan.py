@@ -24,7 +24,7 @@ from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, needs_of
-from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.train.schedule import evenly, views_per_step
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
@@ -211,9 +211,9 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     needs = replace(needs, levels=levels_of(fit.blocks), keeps=not on_cpu)
     fullest = owner == counts.argmax()
     gaussians = cloud_from_points(points[fullest], capture.colors[fullest]).gaussians().to(device)
-    spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
+    spread = [view.to(device) for view in evenly(views, batch)]
     with console.status("Timing a step"):
-        seconds = time_steps(gaussians, spread, training, batch)
+        seconds = time_steps(gaussians, spread, training)
     photo_bytes = sum(3 * view.full.pixels for view in views)
     return Forecast(
         wanted=wanted,
@@ -281,8 +281,8 @@ def shares_of(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> d
     return shares
 
 
-def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig, batch: int) -> float:
-    """Seconds that a step on these Gaussians takes, forward and backward; the best of a few.
+def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig) -> float:
+    """Seconds that a step on these Gaussians and views takes, forward and backward; the best of a few.
 
     On a CPU those in which this thread computes: what else runs on the machine now does not count.
     """
@@ -293,7 +293,7 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
     best = float("inf")
     for step in range(TIMED_STEPS):
         began = clock()
-        shots = [Shot(v, part_to_draw(training, v.full, step, k)) for k, v in enumerate(views[:batch])]
+        shots = [Shot(v, part_to_draw(training, v.full, step, k)) for k, v in enumerate(views)]
         rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
         losses = [
             photometric_loss(

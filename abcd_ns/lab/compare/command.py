@@ -175,7 +175,10 @@ def make_plan(options: Options) -> Plan:
     if len(options.blocks or ()) > 1 or options.vary:
         options = options.over(Options(methods=("abcd",)))
     given = options.over(DEFAULTS if options.tiles is None else TERRAIN_DEFAULTS)
-    _check_methods(given)
+    if not given.methods or len(set(given.methods)) < len(given.methods):
+        raise UserError("Give at least one of --methods, and each once.")
+    if given.steps is None and (counted := {"abcd-paper", "splatfacto-scaled"} & set(given.methods)):
+        raise UserError(f"The schedule of {min(counted)} is in steps: use --steps instead of --seconds.")
     check_numbers("--seeds", given.seeds, 0)
     if given.out is None:
         raise UserError("Give the folder for the results with --out FOLDER.")
@@ -277,13 +280,6 @@ def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
     folders = {(job.method, job.variant, job.seed): job.folder(plan.out) for job in plan.jobs}
     runs = [(arm, next(run for run in arm.runs if not shared or run.seed == shared[0])) for arm in arms]
     return [(run, folders[arm.method, arm.variant, run.seed] / PICTURES) for arm, run in runs]
-
-
-def _check_methods(given: Options) -> None:
-    if not given.methods or len(set(given.methods)) < len(given.methods):
-        raise UserError("Give at least one of --methods, and each once.")
-    if given.steps is None and (counted := {"abcd-paper", "splatfacto-scaled"} & set(given.methods)):
-        raise UserError(f"The schedule of {min(counted)} is in steps: use --steps instead of --seconds.")
 
 
 def _settings(given: Options) -> Settings:
