@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from PIL import ImageStat
 
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import has_alpha, open_picture, orientation, undecodable
@@ -120,11 +121,10 @@ def look(source: PhotoSource) -> Look:
         with open_picture(source.path) as picture:
             turned, alpha = orientation(picture), has_alpha(picture)
             picture.draft("L", REDUCED)
-            histogram = np.array(picture.convert("L").histogram(), dtype=np.float64)
+            brightness = ImageStat.Stat(picture.convert("L")).mean[0] / 255
     except (OSError, SyntaxError, ValueError) as error:
         return Look(0.0, error=str(undecodable(source.path, error)))
-    mean = histogram @ np.arange(256) / histogram.sum()
-    return Look(float(mean / 255), turned, alpha)
+    return Look(brightness, turned, alpha)
 
 
 def copies(sources: Sequence[PhotoSource]) -> list[list[int]]:

@@ -1,7 +1,6 @@
 """A run's folder, read without trusting it: JSON, tensors, and no Python objects."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pickle import UnpicklingError
@@ -23,7 +22,7 @@ from abcd_ns.lab.runs.options import set_options
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Plain, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 from abcd_ns.run import STATE, STORE
 
@@ -106,7 +105,14 @@ def pipeline_config(run: Path, data: Path) -> AbcdPipelineConfig:
     options = {n.removeprefix(prefix): v for n, v in settings.options.items() if n.startswith(prefix)}
     config = registered_config(settings).pipeline
     set_options(config, options, where)
-    _check_paths(options, data, where)
+    folder = (data if data.is_dir() else data.parent).resolve()
+    for name, value in options.items():  # photos, masks and points are those of `data`
+        of_data = name.startswith("datamanager.") and not name.endswith(".data")
+        if not of_data or not isinstance(value, str):
+            continue
+        if "\0" in value or not (folder / value).resolve().is_relative_to(folder):
+            what = one_line(f"pipeline.{name} is {value}")
+            raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
     config.datamanager.data = data
     return config
 
@@ -116,18 +122,6 @@ def _settings_file(run: Path, settings: Settings) -> str:
     versions = settings.versions
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
     return one_line(f"{run / STATE / SETTINGS_FILE} (written by {wrote})")
-
-
-def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
-    """Photos, masks and points are those of `data`, whatever a run's options say."""
-    folder = (data if data.is_dir() else data.parent).resolve()
-    for name, value in options.items():
-        of_data = name.startswith("datamanager.") and not name.endswith(".data")
-        if not of_data or not isinstance(value, str):
-            continue
-        if "\0" in value or not (folder / value).resolve().is_relative_to(folder):
-            what = one_line(f"pipeline.{name} is {value}")
-            raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
 
 
 def registered_config(settings: Settings) -> AbcdTrainerConfig:
