@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from abcd_ns.cli.report.story import read_story
+from abcd_ns.cli.report.run_folder import read_story
 from abcd_ns.cli.terminal import print_facts, print_plain
 from abcd_ns.cli.train import tool
 from abcd_ns.errors import UserError

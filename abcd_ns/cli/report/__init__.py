@@ -1,1 +1,1 @@
-"""`abcd report`: `run_folder` reads a run without trust, `page` puts what the others make into HTML."""
+"""`abcd report`: `run_folder` reads a run without trust, `command` puts what the others make into HTML."""

@@ -20,8 +20,7 @@ from abcd_ns.cli.report.figures import (
     training_command,
 )
 from abcd_ns.cli.report.held_out import HeldOut, pick
-from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
-from abcd_ns.cli.report.story import read_story
+from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run, read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks
