@@ -108,18 +108,14 @@ def gather() -> Facts:
 def _start(module: str) -> str | None:
     """Import it; the error, if any."""
     if module == EXPORT:
-        return _start_apart(module)
+        command = [sys.executable, "-c", f"import {module}"]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
+        return None if run.returncode == 0 else (run.stderr.strip().splitlines() or ["it crashed"])[-1]
     try:
         importlib.import_module(module)
     except IMPORT_TROUBLE as error:
         return f"{type(error).__name__}: {first_line(error)}"
     return None
-
-
-def _start_apart(module: str) -> str | None:
-    command = [sys.executable, "-c", f"import {module}"]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    return None if run.returncode == 0 else (run.stderr.strip().splitlines() or ["it crashed"])[-1]
 
 
 def _seen_by_torch() -> dict[str, Any]:
@@ -164,21 +160,18 @@ def _kernels() -> dict[str, Any]:
 
 def find_extension() -> Path | None:
     """gsplat's CUDA kernels, from its wheel or from an earlier run."""
-    package = importlib.util.find_spec("gsplat")
-    folders = package.submodule_search_locations if package else []
-    found = [*(path for folder in folders for path in Path(folder).glob("csrc*.so")), built_extension()]
-    return next((path for path in found if path.is_file()), None)
-
-
-def built_extension() -> Path:
-    """What gsplat compiles. torch's own `_get_build_directory` would make its folder."""
     import torch
 
     # Its import says that there is no GPU, where there is none.
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     from torch.utils.cpp_extension import get_default_build_root
 
+    package = importlib.util.find_spec("gsplat")
+    folders = package.submodule_search_locations if package else []
+    # torch's own `_get_build_directory` would make the folder.
     kind = f"cu{torch.version.cuda.replace('.', '')}" if torch.version.cuda else "cpu"
     of_this_python = f"py{sys.version_info.major}{sys.version_info.minor}{sys.abiflags}_{kind}"
     default = Path(get_default_build_root()) / of_this_python
-    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or default) / EXTENSION / f"{EXTENSION}.so"
+    built = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or default) / EXTENSION / f"{EXTENSION}.so"
+    found = [*(path for folder in folders for path in Path(folder).glob("csrc*.so")), built]
+    return next((path for path in found if path.is_file()), None)

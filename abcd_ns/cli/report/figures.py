@@ -11,16 +11,7 @@ from abcd_ns.lab.results.tables import NOTHING
 from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.datamanager import OUR_READER
 from abcd_ns.nerfstudio.options import MIRRORED, mirror
-from abcd_ns.nerfstudio.run.log_lines import (
-    EndLine,
-    EpochEndLine,
-    PrunedAtEndLine,
-    SampleLine,
-    TrainingLine,
-    VisitLine,
-    WorkerLine,
-    layer_share,
-)
+from abcd_ns.nerfstudio.run import log_lines
 from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
 from abcd_ns.units import GIB
 from abcd_ns.viewer.texts import clock
@@ -41,12 +32,12 @@ NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
 
 def tiles(run: RunFolder, held_out: HeldOut | None) -> list[tuple[str, str, str]]:
     """The four most important numbers of a run: name, value, and a line of small print."""
-    story, limit, machine = run.story, run.story.last(TrainingLine).limit, run.settings.machine
+    story, limit, machine = run.story, run.story.last(log_lines.TrainingLine).limit, run.settings.machine
     if held_out is not None:
         psnr, ssim = held_out.mean("psnr_merged"), held_out.mean("ssim_merged")
     else:  # the log's last
         psnr, ssim = (story.held_out[-1].psnr, story.held_out[-1].ssim) if story.held_out else (None, None)
-    share = layer_share(story.visits)
+    share = log_lines.layer_share(story.visits)
     layers = f", {share:.0%} of the time for layers" if share else ""
     taken = f"{story.end.seconds:.1f} s" if story.end.seconds < 100 else clock(story.end.seconds)
     ram, device = _peaks(run)
@@ -64,7 +55,7 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[tuple[str, str, str]
 
 def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
     """All other numbers, by name."""
-    story, workers = run.story, run.story.of(WorkerLine)
+    story, workers = run.story, run.story.of(log_lines.WorkerLine)
     found = {"blocks": f"{story.blocks:,}"}
     if held_out is not None and story.blocks > 1:
         psnr, ssim = known(held_out.mean("psnr"), "{:.2f} dB"), known(held_out.mean("ssim"), "{:.3f}")
@@ -73,8 +64,9 @@ def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
         mean, most = sum(held_out.fog) / len(held_out.fog), max(held_out.fog)
         found["fog"] = f"{mean:.1%} of the screen, {most:.1%} at most: Gaussians before the nearest point"
     if story.visits and story.blocks > 1:
-        found["visits"] = f"{len(story.visits)}, {len(story.of(EpochEndLine))} passes over all blocks"
-    if (pruned := story.last(PrunedAtEndLine)) is not None:
+        passes = len(story.of(log_lines.EpochEndLine))
+        found["visits"] = f"{len(story.visits)}, {passes} passes over all blocks"
+    if (pruned := story.last(log_lines.PrunedAtEndLine)) is not None:
         cost, views = pruned.before - pruned.after, many(pruned.views, "training view", "training views")
         share = pruned.gone / max(pruned.gone + pruned.gaussians, 1)
         found["pruned at the end"] = f"{pruned.gone:,} ({share:.0%}), costs {cost:.2f} dB on {views}"
@@ -106,7 +98,7 @@ def _block_row(run: RunFolder, block: int, gaussians: int | None) -> tuple[str, 
         known(run.state.views.get(block)),
         str(len(visits)),
         known(seconds or None, "{:.1f} s"),
-        known(layer_share(visits) if visits else None, "{:.0%}"),
+        known(log_lines.layer_share(visits) if visits else None, "{:.0%}"),
         f"{' to '.join(dict.fromkeys([psnrs[0], psnrs[-1]]))} dB" if psnrs else NOTHING,
         _state(run, block),
     )
@@ -115,7 +107,7 @@ def _block_row(run: RunFolder, block: int, gaussians: int | None) -> tuple[str, 
 def _state(run: RunFolder, block: int) -> str:
     """As the terminal tells it at the end of a run."""
     active = run.state.active
-    if not run.story.of(VisitLine):
+    if not run.story.of(log_lines.VisitLine):
         return "trained in every step"
     if active is not None and active.geometry.block == block:
         return "in training when saved"
@@ -125,7 +117,7 @@ def _state(run: RunFolder, block: int) -> str:
 
 def _peaks(run: RunFolder) -> tuple[str, str]:
     """Of RAM and of GPU memory: samples too, as the end tells of the last process only."""
-    lines, end = run.story.of(SampleLine), run.story.last(EndLine)
+    lines, end = run.story.of(log_lines.SampleLine), run.story.last(log_lines.EndLine)
     ram = [line.rss_bytes for line in lines] + ([end.peak_rss_bytes] if end else [])
     device = [line.device_bytes for line in lines] + ([end.peak_device_bytes] if end else [])
     ram, device = (max((nbytes or 0 for nbytes in found), default=0) for found in (ram, device))
