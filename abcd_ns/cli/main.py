@@ -3,16 +3,13 @@
 import difflib
 import errno
 import importlib
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from abcd_ns import __version__
 from abcd_ns.errors import UserError, missing
-
-# What a shell expects: 2 for wrong usage, 128 + SIGINT for Ctrl-C.
-EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 
 
 class Command(NamedTuple):
@@ -121,13 +118,13 @@ def main(args: Sequence[str] | None = None) -> int:
         message = f"{error.filename or 'The output'} cannot be "
         message += f"written: {error.strerror}; free some space." if is_full else f"used: {error.strerror}."
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return 128 + signal.SIGINT
     from rich.console import Console  # `abcd --help` has no use for it
 
     from abcd_ns.cli.terminal import print_plain
 
     print_plain(f"error: {message}", Console(stderr=True), "red")
-    return EXIT_USER_ERROR
+    return 2
 
 
 if __name__ == "__main__":

@@ -28,10 +28,8 @@ from abcd_ns.errors import UserError, first_line
 
 WORK = "poses.part"
 """The folder in which models are made; a command that is killed leaves it, the next one removes it."""
-FEWEST = 3
-"""Photos."""
-MANY = 400
-"""With more photos, comparing each with each takes hours."""
+FEWEST, MANY = 3, 400
+"""Photos: fewer are refused; with more, comparing each with each takes hours."""
 ENOUGH = 0.9
 """Once this share of the photos has a pose, no other focal length is tried."""
 FOCAL_FACTORS = (1.2, 0.72, 0.5)
@@ -116,8 +114,7 @@ def _put_model(sparse: Path, task: Task, console: Console) -> None:
     shutil.rmtree(task.work, ignore_errors=True)
     task.work.mkdir()
     try:
-        found = find_poses(task, console)
-        if found is None:
+        if (found := find_poses(task, console)) is None:
             why = "They need to overlap, and to be taken from different places."
             raise UserError(f"No two photos in {task.photos} match. {why}")
         sparse.mkdir()

@@ -32,8 +32,6 @@ EXPORT = "open3d"
 STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", OURS, EXPORT)
 """Modules that are imported, each after what it needs."""
 COMPILER = "C++ compiler"
-EXTENSION = "gsplat_cuda"
-"""gsplat's name for what it compiles at first use."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +170,6 @@ def find_extension() -> Path | None:
     kind = f"cu{torch.version.cuda.replace('.', '')}" if torch.version.cuda else "cpu"
     of_this_python = f"py{sys.version_info.major}{sys.version_info.minor}{sys.abiflags}_{kind}"
     default = Path(get_default_build_root()) / of_this_python
-    built = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or default) / EXTENSION / f"{EXTENSION}.so"
+    built = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or default) / "gsplat_cuda/gsplat_cuda.so"
     found = [*(path for folder in folders for path in Path(folder).glob("csrc*.so")), built]
     return next((path for path in found if path.is_file()), None)
