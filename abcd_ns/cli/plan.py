@@ -142,7 +142,6 @@ class Forecast:
 
     wanted: Wanted
     factor: int
-    """By which the photos' width and height are divided."""
     fit: Fit
     batch: int
     points_of_block: tuple[int, ...]
@@ -326,9 +325,8 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     if found.quality:
         rows["quality"] = found.quality
     if found.wanted.workers > 1:
-        rows["workers"] = (
-            f"{found.wanted.workers}, each with as much of a GPU, or of the RAM, as the device below"
-        )
+        each = "each with as much of a GPU, or of the RAM, as the device below"
+        rows["workers"] = f"{found.wanted.workers}, {each}"
     for place, shares in found.shares.items():
         free = f", {bytes_in_words(found.free[place])} may be taken" if place in found.free else ""
         rows[place] = f"{bytes_in_words(sum(shares.values()))} at most{free}"

@@ -85,11 +85,10 @@ class Survey:
     @property
     def photo_bytes(self) -> int:
         """All photos and masks, decoded."""
-        pixels = (
+        return sum(
             source.size[0] * source.size[1] * ((4 if look.alpha else 3) + bool(source.mask_path))
             for source, look in zip(self.prepared.sources, self.looks, strict=True)
         )
-        return sum(pixels)
 
 
 def survey(data: Path, downscale: int | None) -> Survey:

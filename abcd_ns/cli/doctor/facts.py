@@ -58,12 +58,10 @@ class Facts:
     """Of an NVIDIA device, whether torch sees it or not."""
     cpu: str | None = None
     cores: int = 0
-    """That this process may use."""
     gpu: str | None = None
     """Name, memory and capability of the device that training takes."""
     gpus: int = 0
     torch_cuda: str | None = None
-    """The CUDA version that torch was built for."""
     folder: str | None = None
     """Of the CPU rasterizer's library; None where torch or abcd_ns do not start."""
     built: bool = False

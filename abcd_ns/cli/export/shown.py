@@ -55,6 +55,7 @@ class Shown:
         check_trained(self.store)
         self._tree = BlockTree.from_json(self.store.header["tree"])
         self.blocks = range(self._tree.num_blocks)
+        self.antialiased: bool = self.store.header.get(MADE_FOR, {}).get("antialiased", False)
         self._corners = torch.zeros(0, 3, dtype=torch.float64)
         """The lowest and highest coordinates so far."""
 
@@ -62,11 +63,6 @@ class Shown:
     def sh_degree(self) -> int:
         """Of all its Gaussians."""
         return Gaussians(**self._load(0, PARAM_NAMES)).sh_degree
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether it was trained so."""
-        return self.store.header.get(MADE_FOR, {}).get("antialiased", False)
 
     @property
     def largest(self) -> float:
