@@ -71,19 +71,18 @@ examples:
   abcd report --help            the options of one command"""
 
 
-def run_command(name: str, args: list[str]) -> int:
-    """Run a command on its own arguments; returns its exit code.
-
-    Raises:
-        UserError: there is none of this name; the message offers the nearest one.
-        SystemExit: the arguments are wrong.
-    """
+def find_command(name: str) -> Command:
+    """The command called `name`; a UserError that offers the nearest name where there is none."""
     by_name = {command.name: command for command in COMMANDS}
-    if name not in by_name:
-        close = difflib.get_close_matches(name, by_name, n=1)
-        hint = f"did you mean 'abcd {close[0]}'?" if close else f"there are: {', '.join(by_name)}."
-        raise UserError(f"abcd has no command {name!r}; {hint}")
-    command = by_name[name]
+    if name in by_name:
+        return by_name[name]
+    close = difflib.get_close_matches(name, by_name, n=1)
+    hint = f"did you mean 'abcd {close[0]}'?" if close else f"there are: {', '.join(by_name)}."
+    raise UserError(f"abcd has no command {name!r}; {hint}")
+
+
+def run_command(command: Command, args: list[str]) -> int:
+    """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
     if command.passes_on:
         return command.load()(args)
     import tyro  # `abcd --help` has no use for it
@@ -108,7 +107,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if first == "--version":
             print(f"abcd {__version__}")
             return 0
-        return run_command(first, others)
+        return run_command(find_command(first), others)
     except UserError as error:
         message = str(error)
     except OSError as error:

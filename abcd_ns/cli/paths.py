@@ -7,9 +7,6 @@ from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.run import STATE
 
-LEVELS = 3
-"""A run is that many folders below the outputs: SCENE/METHOD/TIME."""
-
 
 def find_run(path: Path, holds: str) -> Path:
     """The folder of a run that is named by it or by its config.yml.
@@ -24,13 +21,13 @@ def find_run(path: Path, holds: str) -> Path:
     if (path / wanted).exists():
         return path
     hint = "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."
-    above = [parent for parent in path.absolute().parents if (parent / wanted).exists()]
-    below = chain.from_iterable(path.glob("*/" * level + wanted) for level in range(1, LEVELS + 1))
-    newest = max(below, key=lambda found: found.stat().st_mtime, default=None)
+    above = (parent for parent in path.absolute().parents if (parent / wanted).exists())
+    below = chain.from_iterable(path.glob("*/" * level + wanted) for level in (1, 2, 3))
+    newest = sorted(below, key=lambda found: found.stat().st_mtime, reverse=True)
     if not path.exists():
         hint = "there is no such folder. If the run was moved, give its new folder."
-    elif above or newest is not None:
-        hint = f"did you mean {above[0] if above else newest.parents[1]}?"
+    elif near := next(chain(above, (found.parents[1] for found in newest)), None):
+        hint = f"did you mean {near}?"
     raise UserError(one_line(f"{path} is no run with {wanted}: {hint}"))
 
 

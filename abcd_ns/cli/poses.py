@@ -50,7 +50,6 @@ class Task:
     work: Path
     """A folder for the database and models."""
     lens: str
-    """COLMAP's camera model."""
     one_lens: bool
     """Whether all photos were taken with one lens at one focal length."""
     order: Order

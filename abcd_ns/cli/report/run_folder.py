@@ -144,8 +144,7 @@ def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
     try:
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
-        why = " ".join(str(error).split())
-        where = _settings_file(run.path, run.settings)
+        why, where = " ".join(str(error).split()), _settings_file(run.path, run.settings)
         raise UserError(one_line(f"{checkpoint.path} does not fit the options in {where}: {why}.")) from None
     return pipeline
 
