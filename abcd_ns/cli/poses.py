@@ -23,7 +23,7 @@ from rich.progress import Progress
 
 from abcd_ns.cli.terminal import few, print_plain
 from abcd_ns.data.input_errors import Problems
-from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_size
+from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_size, visible_files
 from abcd_ns.errors import UserError, first_line
 
 WORK = "poses.part"
@@ -126,7 +126,7 @@ def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
     """The photos' names in their folder, sorted, and what sizes they have."""
     if not folder.is_dir():
         raise UserError(f"{folder} does not exist; put the photos there.")
-    found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    found = sorted(path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
     if len(found) < FEWEST:
         words = f"{folder} has {len(found)} photos; at least {FEWEST} are needed, better 30."
         raise UserError(" ".join([words, *_unread(folder)]))
@@ -141,7 +141,7 @@ def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
 
 def _unread(folder: Path) -> list[str]:
     """A sentence about pictures in the folder that are passed over, if there are any."""
-    kinds = Counter(p.suffix for p in folder.rglob("*") if p.suffix.lower() in UNREAD and p.is_file())
+    kinds = Counter(path.suffix for path in visible_files(folder) if path.suffix.lower() in UNREAD)
     if not kinds:
         return []
     (most, _), *_ = kinds.most_common()

@@ -108,13 +108,14 @@ def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
 
 def test_photos_of_two_sizes_have_two_lenses(tmp_path, monkeypatch, capsys):
     write_blank(tmp_path, 3)
+    (tmp_path / "images" / "._0.png").write_bytes(b"what macOS leaves on other systems' disks")
     tasks: list[poses.Task] = []
     monkeypatch.setattr(poses, "find_poses", lambda task, _: tasks.append(task))
     for size in ((64, 48), (48, 64)):
         Image.new("RGB", size).save(tmp_path / "images" / "9.png")
         with pytest.raises(UserError, match="No two photos"):
             poses.poses(tmp_path)
-    assert [task.one_lens for task in tasks] == [True, False]
+    assert [(len(task.names), task.one_lens) for task in tasks] == [(4, True), (4, False)]
     assert "Photos of 2 sizes" in capsys.readouterr().out
 
 
