@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.tree import BlockTree, Box
@@ -26,7 +27,7 @@ class AssignedScene(VisitScene):
     Args:
         block: the one to be trained.
         state: what its visit begins with.
-        drawn: by block, what gives its Gaussians as others draw them; asked once, and when they are drawn.
+        drawn: by block, what reads its Gaussians as others draw them; called once, when they are drawn.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class AssignedScene(VisitScene):
     ) -> None:
         self.tree = tree
         self._outlines, self._block, self._state = outlines, block, state
-        self._drawn, self._read = drawn, dict[int, Gaussians]()
+        self._drawn = {number: cache(read) for number, read in drawn.items()}
         self._active: Callable[[], Gaussians] | None = None
 
     # What only the active block is asked for is of the assigned one, as its visit found it.
@@ -60,18 +61,13 @@ class AssignedScene(VisitScene):
         return self.state(block).gaussians
 
     def gaussians(self, block: int) -> Gaussians:
-        if block == self._block:
-            return self._state.gaussians if self._active is None else self._active().detach()
-        return self._read_as_drawn(block)
+        if block != self._block:
+            return self._drawn[block]()
+        return self._state.gaussians if self._active is None else self._active().detach()
 
     def as_drawn(self) -> Gaussians:
         """The assigned block as others draw it: without Gaussians that join in this visit."""
-        return self._read_as_drawn(self._block)
-
-    def _read_as_drawn(self, block: int) -> Gaussians:
-        if block not in self._read:
-            self._read[block] = self._drawn[block]()
-        return self._read[block]
+        return self._drawn[self._block]()
 
     def count(self, block: int) -> int:
         is_active = block == self._block and self._active is not None

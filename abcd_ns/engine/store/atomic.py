@@ -50,11 +50,8 @@ def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Replace the content of `path` by `data`; when this returns, it survives a power loss.
-
-    Raises:
-        OSError: the disk refused. `path` then holds either the old content or the new, never a mixture.
-    """
+    """Replace the content of `path`; when this returns, it survives a power loss. If the disk refuses, by
+    OSError, `path` holds either the old content or the new."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
     fsync_folder(path.parent)
@@ -73,37 +70,30 @@ class FolderLockedError(UserError):
 
 
 class FolderLock:
-    """The right to write in a folder: held by one object of one process, and freed when that process dies."""
+    """The right to write in an existing folder: of one object of one process, and freed when that dies.
+
+    Raises:
+        FolderLockedError: someone holds it.
+        OSError: the folder cannot be written to.
+    """
 
     def __init__(self, folder: Path):
-        """Take the lock of an existing folder.
-
-        Raises:
-            FolderLockedError: someone holds it.
-            OSError: the folder cannot be written to.
-        """
         descriptor = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+        self.release = weakref.finalize(self, os.close, descriptor)
+        """Call it to let others write; harmless when done twice."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             holder = os.pread(descriptor, 32, 0).decode(errors="replace").strip() or "unknown"
-            os.close(descriptor)
+            self.release()
             raise FolderLockedError(
                 f"{folder} is being written by another run (process {holder}); "
                 "wait for it, stop it, or choose another folder."
             ) from error
-        except BaseException:
-            os.close(descriptor)
-            raise
         with suppress(OSError):  # the number only serves the message above; a full disk may lack room for it
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        self._close = weakref.finalize(self, os.close, descriptor)
         _held.add(self)
-
-    def release(self) -> None:
-        """Let others write; harmless when done twice."""
-        self._close()
 
 
 _held: "weakref.WeakSet[FolderLock]" = weakref.WeakSet()

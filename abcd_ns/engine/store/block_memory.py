@@ -12,24 +12,23 @@ class BlockMemory:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self._drawn: OrderedDict[BlockName, Packed] = OrderedDict()
-        self._training: OrderedDict[BlockName, Packed] = OrderedDict()
+        self._drawn, self._training = OrderedDict[BlockName, Packed](), OrderedDict[BlockName, Packed]()
 
     @property
     def nbytes(self) -> int:
         """Of all that is here; added up anew, since a read may be broken off anywhere."""
         return sum(block.nbytes for kept in (self._drawn, self._training) for block in kept.values())
 
-    def drawn(self, name: BlockName) -> Packed | None:
-        """What others draw of a stored block, or will, if it is here."""
-        return _used(self._drawn, name)
-
-    def whole(self, name: BlockName) -> Packed | None:
-        """A whole block, if all of it is here."""
-        drawn, training = _used(self._drawn, name), _used(self._training, name)
-        if drawn is None or training is None:
+    def get(self, name: BlockName, *, whole: bool) -> Packed | None:
+        """A block, or what others draw of it; None if that is not here."""
+        parts = (self._drawn, self._training) if whole else (self._drawn,)
+        if not all(name in kept for kept in parts):
             return None
-        return Packed({**drawn.tensors, **training.tensors}, drawn.meta)
+        tensors = {}
+        for kept in parts:
+            kept.move_to_end(name)
+            tensors |= kept[name].tensors
+        return Packed(tensors, self._drawn[name].meta)
 
     def put(self, name: BlockName, block: Packed) -> None:
         """Keep a block, or what others draw of it, in place of what was here of it; `shrink` afterwards."""
@@ -53,11 +52,3 @@ class BlockMemory:
         while beyond > 0 and (self._training or len(self._drawn) > 1):
             _, gone = (self._training or self._drawn).popitem(last=False)
             beyond -= gone.nbytes
-
-
-def _used(kept: OrderedDict, name: BlockName):
-    """What is kept under a name, which is the one used last from now on."""
-    if name not in kept:
-        return None
-    kept.move_to_end(name)
-    return kept[name]

@@ -9,7 +9,6 @@ unseen until that is visited for the first time: neighbours look to each other a
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -22,10 +21,9 @@ from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians
 
 REVEALED_OPACITY = 0.02
-"""Of a Gaussian of the deferred points, once it is seen: enough to be drawn and to learn, too little to spoil
-what is there."""
+"""Of deferred Gaussians, once they are seen: enough to learn, too little to spoil what is there."""
 REVEALED_SCALE = 0.5
-"""Its size, as a share of the distance to its neighbours."""
+"""Their size, as a share of the distance to their neighbours."""
 
 
 def defer(points: BlockState) -> BlockState:
@@ -44,11 +42,10 @@ def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
 def by_block(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[int, BlockState]]:
     """Each block with its part of what a scene begins with, nothing of it trained; one is made at a time."""
     owner = tree.assign(start.means)
-    ends = list(accumulate(owner.bincount(minlength=tree.num_blocks).tolist(), initial=0))
-    order = owner.argsort(stable=True)
+    sizes, order = owner.bincount(minlength=tree.num_blocks).tolist(), owner.argsort(stable=True)
     del owner
-    for block, (first, last) in enumerate(pairwise(ends)):
-        part = start[order[first:last]]
+    for block, rows in enumerate(order.split(sizes)):
+        part = start[rows]
         yield block, BlockState.fresh(part if isinstance(part, Gaussians) else part.gaussians())
 
 

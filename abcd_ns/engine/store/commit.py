@@ -15,16 +15,11 @@ from abcd_ns.engine.store.special_blocks import ACTIVE, DEFERRED, PENDING, WHOLE
 
 
 def state_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) -> BlockState:
-    """What is attached when a visit to `block`, or with WHOLE the warm-up, begins or goes on.
-
-    Args:
-        saved: the visit goes on where a save found it.
-    """
-    state = (
-        scene.state(ACTIVE)
-        if saved
-        else join([with_pending(scene, number) for number in _blocks(scene, block)])
-    )
+    """What is attached when a visit to `block`, or with WHOLE the warm-up, begins, or resumes if `saved`."""
+    if saved:
+        state = scene.state(ACTIVE)
+    else:
+        state = join([with_pending(scene, number) for number in _blocks(scene, block)])
     return replace(state, deferred=None)
 
 
@@ -40,7 +35,7 @@ def _blocks(scene: VisitScene, block: BlockName) -> range:
 
 
 def with_pending(scene: VisitScene, block: int) -> BlockState:
-    """A stored block, joined by those that wait for its next visit."""
+    """A stored block, joined by its pending migrants."""
     state, migrants = scene.state(block), scene.pending_for(block)
     return state if migrants is None else join([state, migrants])
 
@@ -68,15 +63,14 @@ def commit(
 def pending_without(
     scene: StoredScene, blocks: set[int], arrivals: BlockState | None = None
 ) -> dict[BlockName, BlockState]:
-    """The pending migrants, under its name, without what waited for these blocks and with arrivals; nothing
-    where that leaves it as it was."""
-    pending, taken = scene.pending, any(scene.pending_for(block) is not None for block in blocks)
-    come = [] if arrivals is None or not len(arrivals) else [arrivals]
-    if not taken and not come:
+    """The pending migrants, under their name, without those of these blocks and with arrivals; nothing where
+    that leaves them as they were."""
+    parts = [arrivals] if arrivals else []
+    if not parts and all(scene.pending_for(block) is None for block in blocks):
         return {}
-    if pending is not None:
-        come = [without(scene, pending, blocks), *come]
-    return {PENDING: replace(join(come), clocks=Clocks())}
+    if scene.pending is not None:
+        parts.insert(0, without(scene, scene.pending, blocks))
+    return {PENDING: replace(join(parts), clocks=Clocks())}
 
 
 def without(scene: StoredScene, state: BlockState, blocks: Iterable[int]) -> BlockState:

@@ -48,11 +48,7 @@ class Manifest:
         return {shard.file for shard in self.blocks.values()}
 
     def to_bytes(self) -> bytes:
-        """As JSON.
-
-        Raises:
-            TypeError, ValueError: something in it is not JSON.
-        """
+        """As JSON. Raises TypeError or ValueError where something is not JSON."""
         blocks = {str(block): vars(self.blocks[block]) for block in in_order(self.blocks)}
         return _in_envelope(_compact({**vars(self), "blocks": blocks}))
 
@@ -84,11 +80,8 @@ class Manifest:
 
 
 def manifest_path(folder: Path, name: str | None = None) -> Path:
-    """Where the present manifest lies, or the one pinned under `name`.
-
-    Raises:
-        ValueError: a name with other characters than letters, digits, '_', '-' and '.'.
-    """
+    """Where the present manifest lies, or the one pinned under `name`, which ValueError refuses where it has
+    other characters than letters, digits, '_', '-' and '.'."""
     if name is None:
         return folder / "manifest.json"
     if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", name):
@@ -118,11 +111,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def read_checked_manifest(path: Path) -> Manifest:
-    """As `read_manifest`, and every shard is there with its right size.
-
-    Raises:
-        StoreError: as `read_manifest`; or a shard is missing, or has another size.
-    """
+    """As `read_manifest`; StoreError also where a shard is missing, or has another size."""
     while True:
         manifest = read_manifest(path)
         try:

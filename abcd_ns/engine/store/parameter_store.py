@@ -67,10 +67,8 @@ class ParameterStore:
     def open(
         cls, folder: Path | str, name: str | None = None, *, read_only: bool = False
     ) -> "ParameterStore":
-        """The store in `folder`: its present generation for writing, or for reading alone if `read_only`.
-
-        With `name`, the generation pinned under that name, for reading alone.
-        """
+        """The store in `folder`: its present generation, for writing unless `read_only`; with `name` the one
+        pinned under that, for reading alone."""
         folder = Path(folder)
         if not folder.is_dir():
             raise StoreError(f"{folder} does not exist; give the folder of a store.")
@@ -135,21 +133,33 @@ class ParameterStore:
         """A copy of the block's JSON; no file is read."""
         return copy.deepcopy(self._shard(block).meta)
 
-    def load(
-        self, block: BlockName, names: Sequence[str] | None = None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def load(self, block: BlockName, names: Sequence[str] | None = None) -> Content:
         """The tensors of a block, on the CPU and owning their memory, and its JSON.
 
         Args:
-            names: of the tensors that are wanted; the rest of the shard is not read once it was checked. None
-                for all, which are checked each time; of some, each file is checked once in the life of
-                this object.
+            names: of the tensors that are wanted; each file is checked once in the life of this object. None
+                for all, which are checked each time.
 
         Raises:
             KeyError: no such block.
         """
-        tensors, shard = self._read(block, names)
-        return tensors, copy.deepcopy(shard.meta)
+        while True:
+            shard = self._shard(block)
+            path = self.folder / shard.file
+            try:
+                if names is None or shard.file not in self._verified:
+                    verify_shard(path, shard)
+                    self._verified.add(shard.file)
+                return read_shard(path, names), copy.deepcopy(shard.meta)
+            except FileNotFoundError as error:
+                if self._shard(block) == shard:
+                    raise StoreError(
+                        f"{path} is gone: deleted, or replaced by a newer generation than this reader's. "
+                        "Open the store again, or read a pinned generation."
+                    ) from error
+                # A commit of another thread has replaced the shard just now: read the new one.
+            except (OSError, SafetensorError) as error:
+                raise StoreError(f"{path} cannot be read: {error}.") from error
 
     def commit(
         self,
@@ -159,9 +169,8 @@ class ParameterStore:
     ) -> int:
         """Make a new generation in which these blocks are replaced or added; return its number.
 
-        All or nothing, and durable when it returns. Tensors may be of any device, dtype and strides;
-        shards are written one after another, and pairs asked for one after another. None keeps the present
-        header or state.
+        All or nothing, and durable when it returns. Tensors may be of any device, dtype and strides; pairs
+        are asked for one after another. None keeps the present header or state.
 
         Raises:
             StoreError: a write failed, as on a full disk: the new files are gone, unless the disk refuses
@@ -256,25 +265,6 @@ class ParameterStore:
             return self._manifest.blocks[block]
         except KeyError:
             raise KeyError(f"{self.folder} has no block {block}; it has {self.blocks}.") from None
-
-    def _read(self, block: BlockName, names: Sequence[str] | None) -> tuple[dict[str, Tensor], Shard]:
-        while True:
-            shard = self._shard(block)
-            path = self.folder / shard.file
-            try:
-                if names is None or shard.file not in self._verified:
-                    verify_shard(path, shard)
-                    self._verified.add(shard.file)
-                return read_shard(path, names), shard
-            except FileNotFoundError as error:
-                if self._shard(block) == shard:
-                    raise StoreError(
-                        f"{path} is gone: deleted, or replaced by a newer generation than this reader's. "
-                        "Open the store again, or read a pinned generation."
-                    ) from error
-                # A commit of another thread has replaced the shard just now: read the new one.
-            except (OSError, SafetensorError) as error:
-                raise StoreError(f"{path} cannot be read: {error}.") from error
 
     def _require_writable(self) -> None:
         if self._lock is None:

@@ -67,10 +67,7 @@ class VisitScene(BlockScene, Protocol):
 
     def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:
         """From now on `block`, or with None the whole scene, is what `gaussians` returns, not what is stored.
-
-        Args:
-            sh_degree: of the scene's harmonics, of which what is active may have fewer by now.
-        """
+        `sh_degree` is the scene's; what is active may have fewer harmonics by now."""
 
 
 class MemoryScene(BlockScene):
@@ -137,13 +134,13 @@ class StoredScene(VisitScene):
         Args:
             blocks: on the CPU, by number or special name, and tables of the run's under names of their own;
                 they belong to the scene from now on, as `state` does.
-            within: this is written so many seconds after the last write began. With 0 all is durable when
-                this returns, and also where what waits to be written exceeds `ram_bytes`. Not for an
-                active block: training goes on while that is written.
+            within: seconds after the last write began, when this is written. With 0, or where what waits
+                exceeds `ram_bytes`, all is durable when this returns; but training goes on while an active
+                block is written.
 
         Raises:
-            StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
-                written by the next `persist` or `flush`.
+            StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits for the
+                next `persist` or `flush`.
         """
         packed = {n: block if isinstance(block, Packed) else block.packed() for n, block in blocks.items()}
         with self._writer.mutex:
@@ -171,11 +168,8 @@ class StoredScene(VisitScene):
         if pending is not None and len(pending):
             self._pending_by_block = split_by_block(pending, self.tree.assign(pending.gaussians.means))
         for block in before.keys() | self._pending_by_block.keys():
-            old, new = (
-                migrants[block].gaussians.means if block in migrants else None
-                for migrants in (before, self._pending_by_block)
-            )
-            if old is None or new is None or not torch.equal(old, new):
+            old, new = before.get(block), self._pending_by_block.get(block)
+            if not (old and new and torch.equal(old.gaussians.means, new.gaussians.means)):
                 self._versions[block] = next(self._numbers)
 
     def _saved(self, snapshot: Snapshot) -> None:
@@ -212,13 +206,8 @@ class StoredScene(VisitScene):
 
     # -- what is there -------------------------------------------------------------------------------
 
-    @property
-    def is_active_as_a_whole(self) -> bool:
-        """Whether all blocks are active, and `count` is right in sum alone."""
-        return self._active is not None and self._active[0] is None
-
-    def _is_active(self, block: int) -> bool:
-        """Whether the block is, or all of them are."""
+    def _is_active(self, block: int | None) -> bool:
+        """Whether the block is, or all of them are; with None, whether all are."""
         return self._active is not None and self._active[0] in (None, block)
 
     def has(self, name: BlockName) -> bool:
@@ -249,7 +238,7 @@ class StoredScene(VisitScene):
         with self._writer.mutex:
             if name in self._unsaved:
                 return self._unsaved[name]
-            found = self._memory.whole(name) if whole else self._memory.drawn(name)
+            found = self._memory.get(name, whole=whole)
             if found is None:
                 found = Packed(*self.store.load(name, None if whole else DRAWN))
                 self._memory.put(name, found)
@@ -264,19 +253,20 @@ class StoredScene(VisitScene):
 
     def read_ahead(self, block: int) -> None:
         """Have `state` of a block at hand soon; returns at once."""
-        with self._writer.mutex:
-            if block not in self._unsaved and self._memory.whole(block) is None:
-                threading.Thread(target=self._try_to_read, args=(block,), daemon=True).start()
 
-    def _try_to_read(self, block: int) -> None:
-        with suppress(Exception):  # the caller that needs the block meets the error
-            self._packed(block, whole=True)
+        def read() -> None:
+            with suppress(Exception):  # the caller that needs the block meets the error
+                self._packed(block, whole=True)
+
+        with self._writer.mutex:
+            if block not in self._unsaved and self._memory.get(block, whole=True) is None:
+                threading.Thread(target=read, daemon=True).start()
 
     def gaussians(self, block: int) -> Gaussians:
         if not self._is_active(block):
             return self.drawn(block, "cpu")
         active = self._all_active()
-        return active[self.tree.assign(active.means) == block] if self.is_active_as_a_whole else active
+        return active[self.tree.assign(active.means) == block] if self._is_active(None) else active
 
     def _all_active(self) -> Gaussians:
         active = self._active[1]().detach()
@@ -297,7 +287,7 @@ class StoredScene(VisitScene):
 
     def everything(self, device: torch.device | str) -> Gaussians:
         """All blocks, one after the other."""
-        if self.is_active_as_a_whole:  # who lives where is asked once
+        if self._is_active(None):  # which block holds what is asked once
             active = self._all_active()
             return active[self.tree.assign(active.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
@@ -328,12 +318,11 @@ class StoredScene(VisitScene):
     def count(self, block: int) -> int:
         if not self._is_active(block):
             return self.rows(block) + len(self.pending_for(block) or ())
-        # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
-        return 0 if self.is_active_as_a_whole and block > 0 else len(self._active[1]())
+        # Right in sum. Which block holds what changes with every step, and is too slow to ask that often.
+        return 0 if self._is_active(None) and block > 0 else len(self._active[1]())
 
     def parameters(self) -> int:
-        """Of how many numbers all Gaussians are, what is active included; harmonics count up to the degree of
-        each."""
+        """Of all Gaussians, what is active included; harmonics count up to the degree of each."""
         counted = 0 if self._active is None else count_parameters(self._active[1]().features_rest.detach())
         for block in range(self.tree.num_blocks):
             if not self._is_active(block):

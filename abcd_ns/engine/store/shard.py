@@ -37,23 +37,16 @@ def write_shard(
 
 
 def verify_shard(path: Path, shard: Shard) -> None:
-    """Compare every byte of the file with the manifest.
-
-    Raises:
-        StoreError: the file has changed since it was written.
-        OSError: it cannot be read.
-    """
+    """Compare every byte of the file with the manifest. StoreError says that it has changed, OSError that it
+    cannot be read."""
     with open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size != shard.nbytes or _checksum(file) != shard.checksum:
             raise StoreError(f"{path} is damaged: its checksum is wrong. Go back to a pinned generation.")
 
 
 def read_shard(path: Path, names: Iterable[str] | None) -> dict[str, Tensor]:
-    """The tensors of these names, or all, on the CPU.
-
-    Raises:
-        OSError, safetensors.SafetensorError: the file cannot be read, or has no such tensor.
-    """
+    """The tensors of these names, or all, on the CPU. OSError or SafetensorError says that the file cannot be
+    read, or has no such tensor."""
     with _opened(path) as file:
         wanted = sorted(file.keys()) if names is None else names
         # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
@@ -83,8 +76,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 def _plain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """As safetensors wants them: on the CPU, contiguous, and none sharing memory with another."""
-    plain: dict[str, Tensor] = {}
-    storages: set[int] = set()
+    plain, storages = dict[str, Tensor](), set[int]()
     for name, tensor in tensors.items():
         value = tensor.detach().to("cpu", memory_format=torch.preserve_format).contiguous()
         storage = value.untyped_storage().data_ptr()

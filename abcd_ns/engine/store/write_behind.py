@@ -1,12 +1,12 @@
 """Writes to a store beside the training: snapshots of a run, each whole, one after the other.
 
-A thread does it, which lives as long as there is something to write and no longer. It is a daemon: a process
-that ends takes it along, which is as if the process had been killed.
+A thread does it, which lives as long as there is something to write. It is a daemon: the end of the process
+ends it, which is as if the process had been killed.
 
 Processes that train a block are forked from this one, and a thread does not live on in a fork. So a fork
-waits until the thread is between two writes, and takes place with the lock held and free on both sides
-afterwards: no write, and nothing that it holds within torch, the store or the C library, is ever cut in
-two. The child writes nothing, and reads no store: it was handed all blocks.
+waits until the thread is between two writes, and holds the lock: no write, and nothing that it holds within
+torch, the store or the C library, is ever cut in two. The child writes nothing and reads no store: it has
+all blocks.
 """
 
 import math
@@ -52,11 +52,10 @@ class WriteBehind:
     def __init__(self, store: ParameterStore, written: Callable[[Snapshot], None]) -> None:
         self._store, self._written = store, written
         self.mutex = threading.RLock()
-        """Guards all of this, and data that callers share with jobs. It must not be held in a fork. The
-        viewer's pictures are broken off by an exception in whatever line of Python they are: this lock is let
-        go of in none."""
+        """Guards all of this, and data that callers share with jobs. It must not be held in a fork. An
+        exception may break off the viewer's pictures in any line of Python: none of them releases it."""
         self.lock = threading.Condition(self.mutex)
-        """The same, to wait with; for those who are not broken off."""
+        """The same, to wait with, for threads that nothing breaks off."""
         self._waiting: Snapshot | None = None
         self._due, self._began = math.inf, time.monotonic()
         self._error: BaseException | None = None
@@ -80,8 +79,7 @@ class WriteBehind:
                 raise error
 
     def flush(self) -> None:
-        """Write all that waits, and return when it is durable; what failed before is tried again. Raises as
-        `check`."""
+        """Return when all that waits is durable; what failed is tried again. Raises as `check`."""
         with self.lock:
             self._error = None
             if self._waiting is not None:
@@ -108,7 +106,7 @@ class WriteBehind:
                     self.lock.notify_all()
 
     def _next(self) -> Snapshot | None:
-        """What is to be written next; waits for its time. None ends the thread."""
+        """What is to be written next, when its time comes. None ends the thread."""
         with self.lock:
             while self._waiting is not None and (left := self._due - time.monotonic()) < math.inf:
                 if left > 0:
