@@ -27,8 +27,7 @@ class WorkersError(UserError):
 
 @dataclass(frozen=True)
 class VisitTask:
-    """All that decides what a visit makes of its block, besides Gaussians: whatever trains it, and however
-    often, comes to the same."""
+    """All that decides what a visit makes of its block, besides Gaussians."""
 
     active: ActiveVisit
     tree: BlockTree
@@ -41,15 +40,13 @@ class VisitTask:
     epoch: int
     health: BlockHealth
     light: dict[int, Tensor]
-    """By view in use, its transform, on the CPU; the worker applies it and leaves it as it is. Empty for none
-    at all."""
+    """By view in use, its transform, on the CPU; the worker leaves it as it is. Empty without any."""
     poses: dict[str, str]
     """As in RunState; likewise."""
     beside: dict[int, float]
-    """By view that shows them, which part of the other blocks' weight is in flight at the same time; see
-    shared_residual."""
+    """See `shown_beside`."""
     allowance: int | None
-    """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
+    """Gaussians by which the block may grow within the scene's limit; None for any number."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,7 @@ class Parcel:
         return Parcel(replace(outcome, state=outcome.state.nobody), arrays, meta)
 
     def opened(self) -> VisitOutcome:
-        """What was packed, in memory of its own: that of the parcel is for passing on."""
+        """What was packed, in memory of its own."""
         tensors = {name: torch.tensor(array) for name, array in self.arrays.items()}
         return replace(self.outcome, state=BlockState.unpacked(Packed(tensors, self.meta)))
 
@@ -93,7 +90,7 @@ class Assignment:
     """A visit assigned to a worker. It ends when the worker answers, or is given up."""
 
     number: int
-    """No other assignment of the run has it: an answer to one that was given up is known by that."""
+    """No other assignment of the run has it, so that late answers to one that was given up are known."""
     task: VisitTask
     state: Callable[[], BlockState]
     """Reads what the visit begins with, wherever the worker is."""
@@ -103,12 +100,11 @@ class Assignment:
 
 @dataclass(frozen=True)
 class StepsSeen:
-    """A worker is at it."""
+    """A worker has taken steps; `psnr` is the last one's, dB."""
 
     assignment: int
     done: int
     psnr: float
-    """Of the last one, dB."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Lost:
-    """A worker is gone, or too long silent, and with it what it was at."""
+    """A worker is gone, or too long silent, and its visit with it."""
 
     assignment: int
     why: str
@@ -136,7 +132,6 @@ class Member:
 
     number: int
     assignment: Assignment | None = None
-    """What it trains."""
     done: int = 0
     """Steps of its visit so far."""
     ready: bool = True
@@ -176,8 +171,8 @@ class Member:
 class Workers(ABC):
     """Those that train visits."""
 
-    def __init__(self, members: Sequence[Member]) -> None:
-        self._members = list(members)
+    def __init__(self, members: list[Member]) -> None:
+        self._members = members
 
     @property
     def count(self) -> int:
@@ -192,7 +187,7 @@ class Workers(ABC):
     @property
     def pids(self) -> list[int]:
         """Processes of those that train."""
-        return [member.pid for member in self._members if member.assignment is not None]
+        return [member.pid for member in self._members if member.assignment]
 
     @abstractmethod
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
@@ -204,18 +199,14 @@ class Workers(ABC):
 
     def hold(self) -> bool:
         """Stop those that train; whether that can be done. Harmless when done twice."""
-        return not any(member.assignment is not None for member in self._members)
+        return not any(member.assignment for member in self._members)
 
     def resume(self) -> None:  # noqa: B027 - some stop nobody
         """Let those that were stopped continue; to be called before `wait` and `submit`."""
 
     @abstractmethod
     def wait(self, seconds: float) -> list[Report]:
-        """What has happened, in order; waits `seconds` at most.
-
-        Raises:
-            WorkersError: a worker cannot do its work, and no other could.
-        """
+        """What has happened, in order; waits `seconds` at most. WorkersError says what no worker could do."""
 
     def seen(self) -> Sequence[WorkerSeen]:
         """What each is doing."""

@@ -18,11 +18,7 @@ STARTS = 3
 
 
 def check_installed() -> None:
-    """See that Ray can be imported.
-
-    Raises:
-        WorkersError: it cannot.
-    """
+    """Raises WorkersError where Ray cannot be imported."""
     if importlib.util.find_spec("ray") is None:
         raise WorkersError("Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'.")
 
@@ -31,8 +27,7 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
     """Join the cluster whose head is at `address` (host:port), or start one here for as long as we live.
 
     One that is started listens on 127.0.0.1 alone, and asks for a token that only its own processes know. A
-    cluster's token, if it asks for one, is taken from where Ray looks for it: RAY_AUTH_TOKEN, or
-    ~/.ray/auth_token.
+    cluster's token is read where Ray looks for it: RAY_AUTH_TOKEN, or ~/.ray/auth_token.
 
     Raises:
         WorkersError: no Ray, no such cluster, or one that refuses us.
@@ -42,39 +37,37 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
     import ray
 
     ray.shutdown()  # of an earlier run of this process
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "CRITICAL"}
-    local = {"num_cpus": cores, "include_dashboard": False, "_node_ip_address": LOOPBACK}
-    local["object_store_memory"] = object_store_bytes
-    for attempt in range(STARTS):
+    options: dict[str, Any] = {"address": address}
+    if address is None:
+        options = {"num_cpus": cores, "include_dashboard": False, "_node_ip_address": LOOPBACK}
+        options["object_store_memory"] = object_store_bytes
+    failed = f"No Ray cluster answers at {address}" if address else "No Ray could be started here"
+    for left in reversed(range(1 if address else STARTS)):
         try:
-            ray.init(**quiet, **(local if address is None else {"address": address}))
+            ray.init(**options, log_to_driver=False, logging_level="CRITICAL")
             return
         except Exception as error:
             with suppress(Exception):
                 ray.shutdown()
-            if address is not None:
-                raise WorkersError(f"No Ray cluster answers at {address}: {first_line(error)}") from error
-            if attempt == STARTS - 1:
-                raise WorkersError(f"No Ray could be started here: {first_line(error)}") from error
+            if not left:
+                raise WorkersError(f"{failed}: {first_line(error)}") from error
 
 
 def keep_to_ourselves(starts: bool) -> None:
     """Set what Ray reads from the environment, some of it when it is imported.
 
     Args:
-        starts: whether a cluster is started here.
-
-    Raises:
-        WorkersError: it was imported before.
+        starts: whether a cluster is started here; WorkersError says that Ray was imported before.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without num_gpus, leave GPUs visible
-    if starts and "ray" in sys.modules and os.environ.get(ON_LOOPBACK[0]) != ON_LOOPBACK[1]:
+    if not starts:
+        return
+    if "ray" in sys.modules and os.environ.get(ON_LOOPBACK[0]) != ON_LOOPBACK[1]:
         raise WorkersError(
             "Ray was imported before workers were asked for, and would listen to strangers: set "
             f"{'='.join(ON_LOOPBACK)} and RAY_AUTH_MODE=token in the environment."
         )
-    if starts:
-        os.environ["RAY_AUTH_MODE"] = "token"
-        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-        os.environ.update([ON_LOOPBACK])
+    os.environ["RAY_AUTH_MODE"] = "token"
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    os.environ.update([ON_LOOPBACK])

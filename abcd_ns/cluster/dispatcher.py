@@ -91,7 +91,7 @@ class Dispatcher(Coordinator):
 
     @property
     def trains_elsewhere(self) -> bool:
-        """Once the warm-up, or a visit that was saved in its midst, is over."""
+        """Whether the warm-up, or a visit that was saved in its midst, is over."""
         state = self.state
         warms_up = state.visit == 0 and self.scene.has(DEFERRED) and self.progress < self.config.warmup
         return state.active is None and not warms_up
@@ -110,8 +110,7 @@ class Dispatcher(Coordinator):
             self._assign()
             if self._counted < self.state.step or self.finished:
                 break
-            for report in self.workers.wait(SECONDS):
-                self._hear(report)
+            self._listen()
             self.announce(WorkersSeen(tuple(self.workers.seen())))
         self._counted += 1
 
@@ -142,24 +141,22 @@ class Dispatcher(Coordinator):
         self._submit()
         steps = self.run.budget.steps
         while self.progress < 1.0 and (steps is None or self.state.planned < steps):
-            if len(self._in_flight) >= self._lag:
-                if not self._take_in_first():
+            if len(self._in_flight) < self._lag:
+                if self.workers.idle == 0:
                     return
-            elif self.workers.idle == 0:
-                return
-            else:
-                try:
-                    active = self.visits.begin(self._lag)
-                except BlocksBusyError:
-                    if not self._take_in_first():
-                        return
+                if self._begin():
                     continue
-                self._in_flight.append(self._in_flight_of(active))
-                self._submit()
-        while self._in_flight and self._take_in_first():
+            if not self._take_in_first():
+                return
+        while self._take_in_first():
             pass
 
-    def _in_flight_of(self, active: ActiveVisit) -> InFlight:
+    def _begin(self) -> bool:
+        """Begin the next visit; whether there was one, since no block is in flight twice."""
+        try:
+            active = self.visits.begin(self._lag)
+        except BlocksBusyError:
+            return False
         state, scene, block, light = self.state, self.scene, active.geometry.block, self.run.light
         blocks = range(scene.tree.num_blocks)
         migrants = scene.pending_for(block)
@@ -180,9 +177,10 @@ class Dispatcher(Coordinator):
         state.in_flight.append(active)
         own = self.workers.share(with_pending(scene, block))
         assignment = Assignment(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
-        return InFlight(
-            active, assignment, len(migrants or ()), self._ended + active.steps * max(active.batch, 1)
-        )
+        ends = self._ended + active.steps * max(active.batch, 1)
+        self._in_flight.append(InFlight(active, assignment, len(migrants or ()), ends))
+        self._submit()
+        return True
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
         """What reads a block as it is now; what was shared before stays with the assignments that have it."""
@@ -210,9 +208,8 @@ class Dispatcher(Coordinator):
     def _submit(self) -> None:
         for visit in self._in_flight:
             if not visit.submitted and self.workers.idle:
-                now = replace(
-                    visit.assignment.task, seconds=self.stopwatch.seconds
-                )  # it may have waited for long
+                # It may have waited for long.
+                now = replace(visit.assignment.task, seconds=self.stopwatch.seconds)
                 visit.assignment = replace(visit.assignment, task=now)
                 self.workers.submit(visit.assignment)
                 visit.submitted, active, block = True, visit.active, visit.active.geometry.block
@@ -222,20 +219,22 @@ class Dispatcher(Coordinator):
 
     # -- taking in -----------------------------------------------------------------------------------
 
+    def _listen(self) -> None:
+        """Hear of workers, SECONDS at most."""
+        for report in self.workers.wait(SECONDS):
+            self._hear(report)
+
     def _hear(self, report: Report) -> None:
-        visit = next(
-            (visit for visit in self._in_flight if visit.assignment.number == report.assignment), None
-        )
+        visit = next((v for v in self._in_flight if v.assignment.number == report.assignment), None)
         if visit is None or visit.outcome is not None:  # its assignment was given up
             return
         match report:
-            case StepsSeen():
-                number = visit.active.number
-                self.announce(StepTaken(self.state.step, number, report.done, report.psnr))
-            case Finished():
-                visit.outcome = report.outcome
-            case Lost():
-                self._lose(visit, report.why)
+            case StepsSeen(_, done, psnr):
+                self.announce(StepTaken(self.state.step, visit.active.number, done, psnr))
+            case Finished(_, outcome):
+                visit.outcome = outcome
+            case Lost(_, why):
+                self._lose(visit, why)
 
     def _lose(self, visit: InFlight, why: str) -> None:
         visit.losses += 1
@@ -248,9 +247,9 @@ class Dispatcher(Coordinator):
         visit.assignment, visit.submitted = replace(visit.assignment, number=next(self._numbers)), False
 
     def _take_in_first(self) -> bool:
-        """Take in the visit that is to end first, if it is done; whether it was."""
-        visit = min(self._in_flight, key=lambda visit: visit.ends)
-        if visit.outcome is None:
+        """Take in the visit that is to end first, if it is done; whether one was."""
+        visit = min(self._in_flight, key=lambda visit: visit.ends, default=None)
+        if visit is None or visit.outcome is None:
             return False
         self._in_flight.remove(visit)
         self._ended = visit.ends
@@ -278,17 +277,16 @@ class Dispatcher(Coordinator):
         self._counted = self.state.step
 
     def await_visits(self) -> bool:
-        # What no worker has, or has lost, is planned again when the run resumes.
-        self._in_flight = [visit for visit in self._in_flight if visit.submitted]
-        waits = bool(self._in_flight)
-        while self._in_flight:
-            self.resume()
-            for report in self.workers.wait(SECONDS):
-                self._hear(report)
+        waits = any(visit.submitted for visit in self._in_flight)
+        while True:
+            # What no worker has, or has lost, is planned again when the run resumes.
             self._in_flight = [visit for visit in self._in_flight if visit.submitted]
-            while self._in_flight and self._take_in_first():
+            while self._take_in_first():
                 pass
-        return waits
+            if not self._in_flight:
+                return waits
+            self.resume()
+            self._listen()
 
     def dismiss(self) -> None:
         self.workers.close()

@@ -1,8 +1,7 @@
 """Workers on the cores of this machine: for each visit a process is forked, which trains it and ends.
 
-A fork has everything: options, photos, kernels, and every block as it is at that moment. That works
-where no GPU is in use and no thread pool has to be carried over, so a worker computes in a single thread. A
-step of a small block is some hundred short operations, which a second thread hardly makes faster.
+A fork has everything: options, photos, kernels, and every block as it is at that moment. That works where no
+GPU is in use and no thread pool has to be carried over, so a worker computes in a single thread.
 """
 
 import ctypes
@@ -55,8 +54,7 @@ def can_fork(device: torch.device) -> bool:
 
 
 def last_words(error: Exception) -> WorkersError | MemoryError:
-    """Of a worker: MemoryError where another may do better; what the user can repair as it is; of all else,
-    one line of the traceback's end."""
+    """Of a worker: MemoryError where another may do better, else WorkersError in one line."""
     if isinstance(error, UserError):
         return WorkersError(str(error))
     if is_out_of_memory(error):
@@ -116,7 +114,7 @@ class ForkedWorkers(Workers):
     def hold(self) -> bool:
         if self._held_since is None:
             for member in self._members:
-                if member.assignment is not None and not member.lives:
+                if member.assignment and not member.lives:
                     member.pipe.poll(FIRST_WORD)
             self._held_since = time.perf_counter()
             self._signal(signal.SIGSTOP)
@@ -137,16 +135,16 @@ class ForkedWorkers(Workers):
                 os.kill(pid, number)
 
     def wait(self, seconds: float) -> list[Report]:
-        busy = {member.pipe: member for member in self._members if member.assignment is not None}
+        busy = {member.pipe: member for member in self._members if member.assignment}
         reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
-        for member in self._members:
-            if member.assignment is not None and time.monotonic() - member.heard > SILENCE:
+        for member in busy.values():
+            if member.assignment and time.monotonic() - member.heard > SILENCE:
                 reports.append(self._lose(member, f"silent for {SILENCE:.0f} s"))
         return reports
 
     def close(self) -> None:
         for member in self._members:
-            if member.assignment is not None:
+            if member.assignment:
                 self._end(member)
 
     def _hear(self, member: Place) -> list[Report]:
@@ -174,7 +172,7 @@ class ForkedWorkers(Workers):
         return Lost(self._end(member).number, why)
 
     def _end(self, member: Place) -> Assignment:
-        """Its process is no more, and it is idle."""
+        """End its process, and its visit."""
         assignment = member.put_down()
         member.pipe.close()
         if os.getpid() == self._owner:  # a process that was forked meanwhile knows it, too
@@ -185,21 +183,17 @@ class ForkedWorkers(Workers):
         return assignment
 
 
-class _Telling:
-    """Tells the driver how far a visit is, now and then; before its first step, that it goes on."""
-
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe, self._told = pipe, time.monotonic()
-
-    def __call__(self, event: Event) -> None:
-        if time.monotonic() - self._told >= TELL_EVERY:
-            self._told = time.monotonic()
-            self._pipe.send((event.visit_step, event.psnr) if isinstance(event, StepTaken) else None)
-
-
 def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> NoReturn:
     """All that a worker's process does. Any error ends it, after it was reported."""
-    status = 1
+    status, told = 1, time.monotonic()
+
+    def tell(event: Event) -> None:
+        """How far the visit is, now and then; before its first step, that it goes on."""
+        nonlocal told
+        if time.monotonic() - told >= TELL_EVERY:
+            told = time.monotonic()
+            pipe.send((event.visit_step, event.psnr) if isinstance(event, StepTaken) else None)
+
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         signal.set_wakeup_fd(-1)
@@ -207,7 +201,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> 
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         pipe.send(None)
         share_cores(1)
-        pipe.send(Parcel.of(visit(_Telling(pipe))))
+        pipe.send(Parcel.of(visit(tell)))
         status = 0
     except Exception as error:
         with suppress(OSError):

@@ -58,11 +58,7 @@ class Shared:
 
     @staticmethod
     def of(value: Gaussians | BlockState) -> "Shared":
-        """Put it there; the caller owns it.
-
-        Raises:
-            WorkersError: memory is full, and the disk that stands in for it.
-        """
+        """Put it there; the caller owns it. WorkersError says that memory and disk are full."""
         tensors, meta = (dict(value.items()), None) if isinstance(value, Gaussians) else value.packed()
         try:
             return Shared(ray.put({name: tensor.numpy() for name, tensor in tensors.items()}), meta)
@@ -89,7 +85,7 @@ class Actor:
 
         Args:
             version: of abcd_ns where the run was started.
-            make: what makes the worker, pickled: another version may not even read it.
+            make: makes the worker; pickled, as another version may not even read it.
         """
         if version != (own := _version()):
             same = "install the same on all machines"
@@ -169,7 +165,6 @@ class RayWorkers(Workers):
         waits = member.question is not None or not member.ready
         if not waits or time.monotonic() - member.asked_at <= patience:
             return []
-        ray.kill(member.actor)
         return self._replace(member, f"silent for {patience:.0f} s")
 
     def close(self) -> None:
@@ -188,11 +183,8 @@ class RayWorkers(Workers):
     def _ask(self) -> None:
         now = time.monotonic()
         for member in self._members:
-            if (
-                member.assignment is not None
-                and member.question is None
-                and now - member.asked_at > LOOK_EVERY
-            ):
+            is_due = member.question is None and now - member.asked_at > LOOK_EVERY
+            if member.assignment and is_due:
                 member.question, member.asked_at = member.actor.progress.remote(), now
 
     def _answer_of(self, member: Remote) -> list[Report]:
@@ -211,7 +203,6 @@ class RayWorkers(Workers):
             answer = ray.get(ref)
         except of_ray.RayTaskError as error:
             if is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
-                ray.kill(member.actor)
                 return self._replace(member, "out of memory")
             raise _as_user_error(error, member.number) from error
         except of_ray.RayError as error:
@@ -225,8 +216,9 @@ class RayWorkers(Workers):
         return [Finished(assignment.number, answer.opened())]
 
     def _replace(self, member: Remote, why: str) -> list[Report]:
-        """Start another in place of one that is gone."""
-        lost = [] if member.assignment is None else [Lost(member.assignment.number, why)]
+        """End one, if it is not gone, and start another in its place."""
+        ray.kill(member.actor)
+        lost = [Lost(member.assignment.number, why)] if member.assignment else []
         member.deaths += 1
         self._failed_starts += not member.ready
         if self._failed_starts >= STARTS:
@@ -254,8 +246,6 @@ def _as_user_error(error: of_ray.RayTaskError, number: int) -> Exception:
     cause = error.cause
     if isinstance(cause, UserError):
         return WorkersError(f"worker {number + 1}: {cause}")
-    if isinstance(cause, torch.cuda.OutOfMemoryError):
-        return cause
     if isinstance(cause, FULL):
         return _no_room(cause)
-    return error
+    return cause if isinstance(cause, torch.cuda.OutOfMemoryError) else error

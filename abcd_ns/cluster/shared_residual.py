@@ -1,14 +1,13 @@
 """What a block is to make good of the pictures while others are trained at the same time: its share.
 
-Blocks that begin from old versions of each other all see the same error. If each makes good all of it, all
-together overshoot (docs/design.md, Freshness). So each is trained towards a picture between the one that its
+Blocks that begin from old versions of each other all see the same error. If each makes good all of it, they
+overshoot together (docs/design.md, Freshness). So each is trained towards a picture between the one that its
 visit begins with and the photo:
 
     target = picture + share (photo - picture)        share = w / (w + q o)
 
-where w and o are what the block and all others weigh in a pixel, sums of alpha T, and q is the part of the
-others that is out at the same time. The shares of blocks that are out together add up to 1: they meet at the
-photo.
+w and o are the blend weights of the block and of all others in a pixel, sums of alpha T. q is the part of the
+others that is in flight at the same time. The shares of blocks in flight together add up to 1.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -36,13 +35,7 @@ ROOM = 10 / 26
 def shares(
     own: Float[Tensor, "h w"], all_of_them: Float[Tensor, "h w"], beside: float
 ) -> Float[Tensor, "h w"]:
-    """A block's share of each pixel's error; see above.
-
-    Args:
-        own: what the block weighs.
-        all_of_them: what it and all others weigh.
-        beside: q.
-    """
+    """A block's share of each pixel's error, by w, w + o and q; see above."""
     own = own + FAINT
     return own / (own + beside * (all_of_them + FAINT - own).clamp_min(0))
 
@@ -60,11 +53,8 @@ def shown_beside(
     found = {}
     for view in views:
         shown = {b: known.get(view, 0.0) for b, known in influence.items() if b != block}
-        whole = sum(shown.values())
-        if whole > 0:
-            part = sum(shown.get(b, 0.0) for b in sorted(others)) / whole
-        else:
-            part = len(others) / max(blocks - 1, 1)
+        part, whole = sum(shown.get(b, 0.0) for b in sorted(others)), sum(shown.values())
+        part = part / whole if whole > 0 else len(others) / max(blocks - 1, 1)
         if part > 0:
             found[view] = min(part, 1.0)
     return found
@@ -75,8 +65,8 @@ class SharedResidual:
 
     Args:
         own: gives the block as others draw it: without what joins it in this visit.
-        beside: by view, which part of the other blocks' weight is in flight at the same time.
-        room: for pictures. What has none is drawn again when it is asked for.
+        beside: see `shown_beside`.
+        room: for pictures. What has none is drawn again when it is needed.
     """
 
     def __init__(

@@ -69,12 +69,8 @@ class OnAssignment(Visits):
 
 
 class VisitWorker:
-    """Trains visits, one after the other.
-
-    Args:
-        target: gives what a sample is trained on.
-        read_ahead: is told of the photos that are wanted soon.
-    """
+    """Trains visits, one after the other, on what `target` gives for a sample; `read_ahead` hears of events,
+    for photos that are wanted soon."""
 
     def __init__(
         self,
@@ -99,8 +95,7 @@ class VisitWorker:
 
         Args:
             state: what it begins with.
-            drawn: by block, what reads it as others draw it; only those are read that some picture shows.
-            listen: is told of what happens.
+            drawn: by block, what reads it as others draw it; only what some picture shows is read.
             clock: of training time.
         """
         scene = AssignedScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
@@ -115,29 +110,19 @@ class VisitWorker:
         shared = SharedResidual(run, training, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
             self._take_step(training, shared)
-        active, block = run.active, run.active.geometry.block
-        result, state = training.finish(), run.state
-        shown, health = state.influence[block], state.health[block]
+        active, block, result = run.active, run.active.geometry.block, training.finish()
+        shown, health = run.state.influence[block], run.state.health[block]
         return VisitOutcome(result, active.done, shown, health, active.layer_seconds)
 
     def _run_of(self, task: VisitTask, scene: AssignedScene) -> TrainingRun:
-        setup, block = self._setup, task.active.geometry.block
-        empty = Gaussians.empty(setup.config.sh_degree, self._device)
-        params = {name: Parameter(value) for name, value in empty.items()}
-        optimizers = {
-            name: Adam([params[name]], fused=True, **options) for name, options in setup.optimizers.items()
-        }
+        setup, block, device = self._setup, task.active.geometry.block, self._device
+        params = {n: Parameter(v) for n, v in Gaussians.empty(setup.config.sh_degree, device).items()}
+        adams = {n: Adam([params[n]], fused=True, **options) for n, options in setup.optimizers.items()}
+        # Two workers may show one photo: whose transform should stay?
+        light = None if setup.config.light == "none" else HeldLight(task.light, device)
+        rasterizer, views = self._rasterizer, setup.views
         run = TrainingRun(
-            setup.config,
-            setup.budget,
-            scene,
-            setup.views,
-            self._rasterizer,
-            params,
-            optimizers,
-            device=self._device,
-            # Two workers may show one photo: whose transform should stay?
-            light=None if setup.config.light == "none" else HeldLight(task.light, self._device),
+            setup.config, setup.budget, scene, views, rasterizer, params, adams, device=device, light=light
         )
         run.state = RunState(
             step=task.step,

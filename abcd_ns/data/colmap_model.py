@@ -19,8 +19,8 @@ from abcd_ns.data.ply import read_points
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, rigid
 from abcd_ns.data.split_lists import read_list_files
 
-MODEL_FOLDERS = ("sparse/*", "colmap/sparse/*", "sparse", "colmap/sparse", "colmap", ".")
-"""Where models may lie under the data folder."""
+MODEL_FOLDERS = ("sparse/*", "colmap/sparse/*", "sparse", "colmap/sparse", "colmap")
+"""Where models may lie under the data folder, if not in it."""
 IMAGES = Path("images")
 """Where its photos lie, if nothing else is said."""
 
@@ -49,23 +49,20 @@ _MAX_NAME = 1 << 16
 
 def find_models(data: Path) -> list[Path]:
     """The folders of `data` that hold a COLMAP model; that with most photos comes first."""
-    globs = (sorted(data.glob(each)) if "*" in each else [data / each] for each in MODEL_FOLDERS)
-    places = [place for found in globs for place in found]
-    found = [p for p in places if (all if p == data else any)(_part(p, n) for n in ("cameras", "images"))]
+    places = [place for each in MODEL_FOLDERS for place in sorted(data.glob(each))]
+    found = [p for p in places if _part(p, "cameras") or _part(p, "images")]
+    found += [data] if _part(data, "cameras") and _part(data, "images") else []
     return sorted(found, key=_count_photos, reverse=True) if len(found) > 1 else found
 
 
 def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
-    """The scene of a COLMAP model.
+    """The scene of a COLMAP model, in a z-up world: `applied_transform` is the change of axes from COLMAP's.
 
     Args:
         data: the data root.
         model: the folder with cameras and images, as .bin or else .txt, and points3D as either or .ply.
         images: the folder of photos, from `data`. Where there is no IMAGES, photos may lie in `data` itself.
         masks: the folder of masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg.
-
-    Returns:
-        The scene in a z-up world: `applied_transform` is the change of axes from COLMAP's.
     """
     problems, found = Problems(), []
     cameras, listed = (_part(model, name) or model / f"{name}.bin" for name in ("cameras", "images"))
@@ -124,18 +121,21 @@ def _count_photos(model: Path) -> int:
 def _photo_folder(data: Path, images: Path, names: list[str]) -> Path:
     """`images`, as its case may be; or `data` itself, where the first photo lies there."""
     photos = data / images
-    if not photos.is_dir() and images == IMAGES:
-        alike = (path for path in data.iterdir() if path.is_dir() and path.name.lower() == IMAGES.name)
-        flat = [data] if names and FileFinder(data, data).find(names[0], moved=False).is_file() else []
-        return next(alike, next(iter(flat), photos))
-    return photos
+    if photos.is_dir() or images != IMAGES:
+        return photos
+    for path in data.iterdir():
+        if path.is_dir() and path.name.lower() == IMAGES.name:
+            return path
+    is_flat = names and FileFinder(data, data).find(names[0], moved=False).is_file()
+    return data if is_flat else photos
 
 
 def _mask(files: FileFinder, name: str) -> Path | None:
     """The mask of a photo."""
-    names = (str(Path(name).with_suffix(".png")), f"{name}.png")
-    found = (files.find(each, moved=False) for each in names)
-    return next((path for path in found if path.exists()), None)
+    for each in (str(Path(name).with_suffix(".png")), f"{name}.png"):
+        if (path := files.find(each, moved=False)).exists():
+            return path
+    return None
 
 
 def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> np.ndarray:
@@ -184,36 +184,36 @@ class _Cursor:
         self.skip(struct.calcsize("<" + layout))
         return struct.unpack_from("<" + layout, self.data, start)
 
+    def check(self, sound: bool, fault: str) -> None:
+        """Refuse a file that is not sound."""
+        if not sound:
+            raise InputError(f"{self.path} {fault}; copy or make it again.")
+
     def skip(self, size: int) -> None:
         """Go on by `size` bytes, which must be there."""
-        if size > len(self.data) - self.at:
-            end = len(self.data)
-            raise InputError(f"{self.path} is cut: it ends at byte {end} inside an entry; make it again.")
+        end = len(self.data)
+        self.check(size <= end - self.at, f"is cut: it ends at byte {end} inside an entry")
         self.at += size
 
     def count(self, smallest: int) -> int:
         """A number of entries of at least `smallest` bytes each, which must fit into what is left."""
         (n,) = self.take("Q")
         left = len(self.data) - self.at
-        if n * smallest > left:
-            what = f"claims {n} entries but only {left} bytes follow"
-            raise InputError(f"{self.path} {what}; copy or make it again.")
+        self.check(n * smallest <= left, f"claims {n} entries but only {left} bytes follow")
         return n
 
     def name(self) -> str:
         """Characters up to a zero byte."""
         end = self.data.find(b"\0", self.at, self.at + _MAX_NAME)
-        if end < 0:
-            raise InputError(f"{self.path} is damaged: a photo's name has no end; copy or make it again.")
+        self.check(end >= 0, "is damaged: a photo's name has no end")
         text = self.data[self.at : end].decode("utf-8", "surrogateescape")
         self.at = end + 1
         return text
 
     def finish(self) -> None:
         """Refuse bytes after the last entry: the count was wrong."""
-        if self.at != len(self.data):
-            what = f"has {len(self.data) - self.at} bytes more than its entries need"
-            raise InputError(f"{self.path} {what}; copy or make it again.")
+        more = len(self.data) - self.at
+        self.check(not more, f"has {more} bytes more than its entries need")
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:

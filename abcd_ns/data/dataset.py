@@ -1,7 +1,7 @@
 """nerfstudio's dataset over Photos, of what our own reader or another of nerfstudio's found.
 
-Others name files and cameras; what they leave to nerfstudio's datamanager, undistorting and putting photos
-onto a background, is done here as for our own reader: in memory, and checked beforehand.
+Others name files and cameras. Undistorting photos and putting them onto a background is done here as for our
+own reader: in memory, and checked beforehand.
 """
 
 import dataclasses
@@ -55,11 +55,9 @@ class AbcdDataset(InputDataset):
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """`image_idx`, `image` [H, W, 3 or 4] of the type asked for and, if any, `mask` bool [H, W, 1]."""
         read = {"uint8": self.get_image_uint8, "float32": self.get_image_float32}[image_type]
-        data = {"image_idx": image_idx, "image": read(image_idx)}
         mask = self.photos.mask(image_idx)
-        if mask is not None:
-            data["mask"] = mask
-        return data
+        data = {"image_idx": image_idx, "image": read(image_idx)}
+        return data if mask is None else data | {"mask": mask}
 
 
 def has_views(outputs: DataparserOutputs) -> bool:
@@ -77,12 +75,11 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
         return outputs
     if outputs.metadata.get("mask_color") is not None:
         raise InputError("--mask-color has no effect here: masked pixels are not trained on. Leave it out.")
-    color = outputs.alpha_color
-    alpha_color = None if color is None else tuple(float(value) for value in color)
-    sources, lenses, problems, finders = [], [], Problems(), {}
     if not outputs.cameras.camera_to_worlds.isfinite().all():
         fix = "where the reader has an --orientation-method, set it to none"
         raise InputError(f"{outputs.image_filenames[0]} and others have poses with NaN or infinity; {fix}.")
+    alpha_color = None if outputs.alpha_color is None else tuple(map(float, outputs.alpha_color))
+    sources, lenses, problems, finders = [], [], Problems(), {}
     for row, path in enumerate(outputs.image_filenames):
         with problems.collect(name=str(path)):
             lens = _lens(outputs.cameras, row, str(path))
@@ -101,11 +98,10 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()
-    cameras = pinhole_cameras(lenses, outputs.cameras.camera_to_worlds)
     return dataclasses.replace(
         outputs,
         image_filenames=[source.path for source in sources],
-        cameras=cameras,
+        cameras=pinhole_cameras(lenses, outputs.cameras.camera_to_worlds),
         metadata={**outputs.metadata, PHOTOS: sources},
     )
 

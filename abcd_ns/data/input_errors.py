@@ -58,7 +58,7 @@ class InputError(UserError):
 
 
 class Problems(list[str]):
-    """Collects errors so that all bad files are named at once, instead of one per run."""
+    """Collects errors, so that all bad files are named at once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -80,11 +80,7 @@ class Problems(list[str]):
                     self._alike.setdefault(self[-1].replace(one_line(name), ""), []).append(self[-1])
 
     def raise_if_any(self) -> None:
-        """Raise one InputError with all that was noted.
-
-        Raises:
-            InputError: something was noted.
-        """
+        """Raise one InputError with all that was noted, if anything was."""
         lines = list(dict.fromkeys(self))
         for first, *others in self._alike.values():
             if len(others) >= FEW:

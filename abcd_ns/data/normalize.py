@@ -50,15 +50,11 @@ class Similarity:
 def normalizing_similarity(
     poses: np.ndarray, orientation: Orientation, center: Center, auto_scale: bool, scale_factor: float
 ) -> Similarity:
-    """The frame that nerfstudio's auto_orient_and_center_poses and auto_scale_poses choose.
+    """The frame that nerfstudio's auto_orient_and_center_poses and auto_scale_poses choose for `poses`, camera
+    to world, float64 [n, 3, 4], OpenGL convention.
 
     nerfstudio works in float32, where geo-referenced coordinates (1e6 m) have lost half a metre. So the
     mean of the centres is taken off in float64 first; both its rotation and its centre commute with that.
-
-    Args:
-        poses: camera to world, float64 [n, 3, 4], OpenGL convention.
-        auto_scale: scale until the farthest camera's largest coordinate is 1.
-        scale_factor: on top of it.
     """
     middle = poses[..., 3].mean(axis=0)
     near = torch.eye(4).repeat(len(poses), 1, 1)

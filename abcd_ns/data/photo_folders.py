@@ -56,12 +56,13 @@ def _hint(scene: Scene) -> str:
     if not (scene.frames and scene.model.is_dir()):
         return ""
     name, root = scene.frames[0].name, scene.root
-    found = (path.as_posix() for path in visible_files(root))
-    at = next((path.removesuffix(name) for path in found if path.endswith(f"/{name}")), None)
-    above = next((p for p in root.absolute().parents[:3] if (p / IMAGES / name).exists()), None)
-    if above:
-        return f", or give --data {above}"
-    return f", or set {OPTION}images-path {os.path.relpath(at, root)}" if at else ""
+    for above in root.absolute().parents[:3]:
+        if (above / IMAGES / name).exists():
+            return f", or give --data {above}"
+    for path in map(Path.as_posix, visible_files(root)):
+        if path.endswith(f"/{name}"):
+            return f", or set {OPTION}images-path {os.path.relpath(path.removesuffix(name), root)}"
+    return ""
 
 
 def as_stored(scene: Scene) -> Scene:
@@ -69,21 +70,22 @@ def as_stored(scene: Scene) -> Scene:
 
     The first photo is looked at; only if it has another size than its camera, so are all.
     """
-    finder, problems, sizes = FileFinder(scene.photo_folder, scene.model), Problems(), []
+    finder, sizes = FileFinder(scene.photo_folder, scene.model), []
     for frame in scene.frames:
-        with problems.collect():
+        try:
             sizes.append(read_size(finder.find(frame.name)))
-        if problems or sizes[0] == frame.lens.size:
+        except InputError:
+            return scene
+        if sizes[0] == frame.lens.size:
             return scene
     pairs = list(zip(sizes, (frame.lens.size for frame in scene.frames), strict=True))
-    (have, _), (want, _) = share = max(pairs, default=((1, 1), (1, 1)))
-    fits = all(abs(h * want - w * have) < want for pair in pairs for h, w in zip(*pair, strict=True))
-    if not fits:
-        return scene
+    (width, height), (of_width, of_height) = max(pairs, default=((1, 1), (1, 1)))
+    for pair in pairs:
+        if any(abs(have * of_width - want * width) >= of_width for have, want in zip(*pair, strict=True)):
+            return scene
     frames = [replace(f, lens=f.lens.resized(*size)) for f, size in zip(scene.frames, sizes, strict=True)]
-    (width, height), (of_width, of_height) = share
     note = (
-        f"The photos in {scene.photo_folder} are {have / want:.3g} times as large as their cameras, as "
+        f"The photos in {scene.photo_folder} are {width / of_width:.3g} times as large as their cameras, as "
         f"{width} x {height} px and {of_width} x {of_height}: cameras are scaled to them."
     )
     return replace(scene, frames=frames, notes=[*scene.notes, note])
@@ -101,11 +103,10 @@ def _reduced_folders(scene: Scene) -> dict[int, Path]:
     """N: folder, for the folders <photo_folder>_N beside the photo folder."""
     if scene.photo_folder == scene.root:
         return {}
-    prefix = scene.photo_folder.name + "_"
-    found = {}
+    found, prefix = {}, scene.photo_folder.name
     for folder in scene.photo_folder.parent.glob("*_*"):
-        number = folder.name.removeprefix(prefix)
-        if folder.name.startswith(prefix) and number.isdecimal() and int(number) > 1 and folder.is_dir():
+        name, _, number = folder.name.rpartition("_")
+        if name == prefix and number.isdecimal() and int(number) > 1 and folder.is_dir():
             found[int(number)] = folder
     return found
 

@@ -86,7 +86,7 @@ class Photos:
 
     @property
     def cached_bytes(self) -> int:
-        """Of decoded pixels that are kept now; at most the budget."""
+        """Of decoded pixels that are kept now."""
         return self._kept.currsize
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
@@ -99,7 +99,7 @@ class Photos:
         requests: as many as take an eighth of the budget, and a few in any case."""
         for index in islice(indices, self._ahead):
             self._expect(("image", index))
-            if self.sources[index].mask_path is not None:
+            if self.sources[index].mask_path:
                 self._expect(("mask", index))
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
@@ -107,9 +107,7 @@ class Photos:
 
         A reduced or undistorted pixel counts only if all pixels that it is made of count.
         """
-        if self.sources[index].mask_path is None:
-            return None
-        return self._get(("mask", index))
+        return self._get(("mask", index)) if self.sources[index].mask_path else None
 
     def _read(self, key: _Key) -> Tensor:
         kind, index = key
@@ -118,11 +116,11 @@ class Photos:
     def _expect(self, key: _Key) -> None:
         """Read it on another thread, for the next `_get`."""
         with self._lock:
-            if key in self._expected:
-                self._expected.move_to_end(key)
-            if key in self._kept or key in self._expected:
+            if key in self._kept:
                 return
-            self._expected[key] = self._readers.submit(self._read, key)
+            if key not in self._expected:
+                self._expected[key] = self._readers.submit(self._read, key)
+            self._expected.move_to_end(key)
             while len(self._expected) > 2 * self._ahead:  # with a mask each; else its visit is over
                 self._expected.popitem(last=False)[1].cancel()
 
@@ -140,11 +138,8 @@ class Photos:
 
 
 def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[np.ndarray, "y x c"]:
-    """The mean of the source's area that each pixel of the result covers, of the same type.
-
-    Args:
-        size: (width, height) of the result, at most the source's; the ratio need not be whole.
-    """
+    """The mean of the source's area that each pixel of the result covers, of the same type. `size` is (width,
+    height), at most the source's; the ratio need not be whole."""
     if size == (image.shape[1], image.shape[0]):
         return image
     reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -154,12 +149,8 @@ def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[n
 def weighted_by_alpha(
     image: UInt8[np.ndarray, "h w c"], change: Callable[[np.ndarray], np.ndarray]
 ) -> UInt8[np.ndarray, "y x c"]:
-    """A resampled photo; with alpha, colours are resampled times alpha, so that what lies below transparent
-    pixels does not show.
-
-    Args:
-        change: resamples each channel, of uint8 or float32.
-    """
+    """A photo resampled by `change`, of uint8 or float32. With alpha, colours are resampled times alpha, so
+    that what lies below transparent pixels does not show."""
     if image.shape[2] < 4 or (image[..., 3] == 255).all():
         return change(image)
     alpha = image[..., 3:].astype(np.float32) / 255
@@ -189,7 +180,7 @@ def visible(picture: Image.Image) -> Bool[np.ndarray, "h w"]:
 
 
 def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether a picture is large enough for a size, and of its proportion to half a pixel of the result."""
+    """Whether a picture is large enough for a size, and in its proportion to half a pixel of the result."""
     (wide, high), (width, height) = stored, size
     return wide >= width and high >= height and abs(wide / high * height - width) <= max(1, width / height)
 
@@ -203,15 +194,11 @@ def _decode(path: Path, pixels: Callable[[Image.Image], np.ndarray]) -> np.ndarr
         raise undecodable(path, error) from None
 
 
-def _as_stored(picture: Image.Image) -> UInt8[np.ndarray, "h w c"]:
-    return np.array(picture.convert("RGBA" if has_alpha(picture) else "RGB"))
-
-
 def _read_photo(source: PhotoSource) -> Tensor:
-    image = _decode(source.path, _as_stored)
-    if (image.shape[1], image.shape[0]) != source.stored:
-        wanted = f"{source.stored[0]} x {source.stored[1]}"
-        raise InputError(f"{source.path} is no longer {wanted} px; put the photo back.")
+    image = _decode(source.path, lambda p: np.array(p.convert("RGBA" if has_alpha(p) else "RGB")))
+    width, height = source.stored
+    if image.shape[:2] != (height, width):
+        raise InputError(f"{source.path} is no longer {width} x {height} px; put the photo back.")
     if source.alpha_color is not None and image.shape[2] == 4:
         alpha, behind = image[..., 3:].astype(np.float32) / 255, 255 * np.float32(source.alpha_color)
         image = np.rint(image[..., :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
@@ -224,10 +211,10 @@ def _read_photo(source: PhotoSource) -> Tensor:
 
 def _read_mask(source: PhotoSource) -> Tensor:
     mask = _decode(source.mask_path, visible)[..., None]
-    width, height = source.stored
-    if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
-        shape = f"{mask.shape[1]} x {mask.shape[0]} px"
-        raise InputError(f"{source.mask_path}: {shape}, unlike its photo ({width} x {height}); replace it.")
+    size, (width, height) = mask.shape[1::-1], source.stored
+    if not reduces_to(size, source.reduced):  # masks_N and full-size masks both do
+        shapes = f"{size[0]} x {size[1]} px, unlike its photo ({width} x {height})"
+        raise InputError(f"{source.mask_path}: {shapes}; replace it.")
     used = area_reduce(mask * np.uint8(_MASK_USED), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)
     if source.undistortion:

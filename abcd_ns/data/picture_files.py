@@ -30,11 +30,8 @@ _PNG_BIT_DEPTH_BYTE = 24
 
 
 def check_regular(path: Path, kind: str = "photo") -> None:
-    """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes.
-
-    Args:
-        kind: what it is, for the message.
-    """
+    """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes; `kind` is
+    what the message calls it."""
     try:
         status = path.stat()
     except OSError as error:
@@ -88,11 +85,11 @@ class FileFinder:
     @property
     def notes(self) -> list[str]:
         """How many files are read under other names than they were called by, if there are any."""
-        renamed = {
-            name: path.relative_to(os.path.abspath(self.folder)) for name, path in self._renamed.items()
-        }
-        example = next((f"{name} is {path}" for name, path in renamed.items()), None)
-        return [f"{self.said_by}: {len(renamed)} files have other names ({example}, ...)."] if example else []
+        if not self._renamed:
+            return []
+        name, path = next(iter(self._renamed.items()))
+        example = f"{name} is {path.relative_to(os.path.abspath(self.folder))}"
+        return [f"{self.said_by}: {len(self._renamed)} files have other names ({example}, ...)."]
 
     @cached_property
     def _files(self) -> dict[str, list[Path]]:
@@ -123,8 +120,7 @@ def _without_ending(key: str) -> str:
 
 
 def open_picture(path: Path) -> Image.Image:
-    """Pillow's picture, not yet decoded, of a format among FORMATS. Raises what Pillow does: OSError,
-    SyntaxError, ValueError."""
+    """Pillow's picture, not yet decoded, of one of FORMATS; else OSError, SyntaxError or ValueError."""
     return Image.open(path, formats=FORMATS)
 
 
@@ -145,11 +141,7 @@ def undecodable(path: Path, error: Exception) -> InputError:
 
 def read_size(path: Path, kind: Literal["photo", "mask"] = "photo") -> tuple[int, int]:
     """(width, height) of a photo or mask as stored: EXIF orientation is not applied, as COLMAP does not.
-    Reads a few hundred bytes. Not thread-safe (it sets warning filters).
-
-    Args:
-        kind: of photos, what is not converted to 8-bit RGB without loss is refused.
-    """
+    Refuses photos that 8-bit RGB would change. Not thread-safe (it sets warning filters)."""
     check_regular(path, kind)
     try:
         with warnings.catch_warnings():
@@ -175,14 +167,14 @@ def is_turned(path: Path) -> bool:
 
 def _check_kind(path: Path, picture: Image.Image) -> None:
     """Refuse pictures whose conversion to 8-bit sRGB would be a guess."""
-    deep = picture.mode.startswith(("I", "F"))
+    bits = 16 if picture.mode.startswith(("I", "F")) else 8
+    # Pillow cuts 16-bit RGB to 8 bits without a word, so look at the file.
     if picture.format == "PNG":
-        # Pillow cuts 16-bit RGB to 8 bits without a word, here and in TIFF, so look at the file.
         with path.open("rb") as file:
-            deep = deep or file.read(_PNG_BIT_DEPTH_BYTE + 1)[_PNG_BIT_DEPTH_BYTE] == 16
-    if picture.format == "TIFF":
-        deep = deep or max(picture.tag_v2.get(ExifTags.Base.BitsPerSample, (8,))) > 8
-    if deep:
+            bits = max(bits, file.read(_PNG_BIT_DEPTH_BYTE + 1)[_PNG_BIT_DEPTH_BYTE])
+    elif picture.format == "TIFF":
+        bits = max(bits, *picture.tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
+    if bits > 8:
         raise InputError(f"{path} has more than 8 bits a channel; convert it to 8 bits.")
     if picture.mode not in _MODES:
         raise InputError(f"{path} is a {picture.mode} picture; convert it to RGB.")

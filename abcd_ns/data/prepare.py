@@ -88,36 +88,30 @@ class Prepared:
     """What was chosen where the user said nothing."""
 
 
-def read_scene(
-    data: Path, colmap: Path | None = None, images: Path = IMAGES, masks: Path | None = None
-) -> Scene:
-    """The model in `data`, COLMAP's before transforms.json, and that before transforms_train.json.
-
-    Args:
-        colmap: the folder of COLMAP's model, from `data`; None takes that with most photos.
-        images, masks: folders of a COLMAP model's photos and masks, from `data`.
-    """
+def read_scene(options: SceneOptions) -> Scene:
+    """What the model says: COLMAP's before transforms.json, and that before transforms_train.json."""
+    data, images, masks = options.data, options.images_path, options.masks_path
     whole = data if data.suffix == ".json" else data / f"{TRANSFORMS}.json"
-    models = find_models(data) if colmap is None else [data / colmap]
+    models = find_models(data) if options.colmap_path is None else [data / options.colmap_path]
     if models and not (whole.exists() and models == [data]):  # whose cameras.txt may be anything
         scene = read_colmap(data, models[0], images, masks)
         if len(models) > 1:
-            others = ", ".join(str(os.path.relpath(model, data)) for model in models[1:])
+            others = ", ".join(os.path.relpath(model, data) for model in models[1:])
             more = f"the others have no more photos ({others}): {OPTION}colmap-path takes one of them"
             scene.notes.append(f"{models[0]} is used, with {len(scene.frames)} photos; {more}.")
         if whole.exists():
             scene.notes.append(f"{models[0]} is used; give --data {whole} for the other.")
         return scene
-    found = next((path for path in (whole, data / f"{TRANSFORMS}_train.json") if path.exists()), None)
-    if found is not None and (images, masks) != (IMAGES, None):
-        fix = f"leave out {OPTION}images-path and masks-path"
-        raise InputError(f"{found} names photos and masks itself: {fix}.")
-    if found is not None:
-        return read_transforms(found) if found == whole else read_split_transforms(data)
-    found = (
-        "is a file" if data.is_file() else "holds no model (such as sparse/0/cameras.bin or transforms.json)"
-    )
-    raise InputError(f"--data {data} {found if data.exists() else 'does not exist'}; {_advice(data)}.")
+    for path in (whole, data / f"{TRANSFORMS}_train.json"):
+        if path.exists():
+            if (images, masks) != (IMAGES, None):
+                fix = f"leave out {OPTION}images-path and masks-path"
+                raise InputError(f"{path} names photos and masks itself: {fix}.")
+            return read_transforms(path) if path == whole else read_split_transforms(data)
+    found = "is a file" if data.exists() else "does not exist"
+    if data.is_dir():
+        found = "holds no model (such as sparse/0/cameras.bin or transforms.json)"
+    raise InputError(f"--data {data} {found}; {_advice(data)}.")
 
 
 def _advice(data: Path) -> str:
@@ -165,8 +159,7 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
         raise InputError(f"{OPTION}scale-factor is {options.scale_factor}; it must be above 0 and finite.")
     problems = Problems()
     try:
-        scene = read_scene(options.data, options.colmap_path, options.images_path, options.masks_path)
-        scene = as_stored(scene)
+        scene = as_stored(read_scene(options))
         factor = automatic_factor(scene, options.max_side) if wanted is None else int(wanted)
         with problems.collect():
             check_layout(scene)
@@ -238,15 +231,12 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSou
         if frame.mask_path is not None:
             with problems.collect():  # measured before it is decoded
                 read_size(frame.mask_path, "mask")
-    try:
-        with problems.collect():
-            files, notes = locate_photos(scene, factor)
-        problems.raise_if_any()
-    except InputError as error:
-        if needed:
-            raise
-        files, notes = assume_photos(scene, factor), [f"Going on without photos: {error.lines[0]}"]
-    return files, notes
+    with problems.collect():
+        found = locate_photos(scene, factor)
+    if problems and not needed:
+        return assume_photos(scene, factor), [f"Going on without photos: {problems[0]}"]
+    problems.raise_if_any()
+    return found
 
 
 def _sources(scene: Scene, files: list[PhotoSource]) -> tuple[list[PhotoSource], list[Lens]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.split_lists import SplitLists
 
 MAX_SIDE = 100_000
@@ -76,7 +76,7 @@ class Scene:
     root: Path
     """The data root; no path leads out of it."""
     photo_folder: Path
-    """Holds the photos; reduced copies may lie beside it, as in images_4."""
+    """Holds the photos. Reduced copies may lie beside it, as in images_4."""
     frames: list[Frame]
     points_xyz: np.ndarray
     """float64 [n, 3], world of the Scene."""
@@ -93,11 +93,10 @@ class Scene:
 
 def check_lens(lens: Lens, label: str) -> None:
     """Refuse what no camera has; lenses are told apart from broken files by wide margins."""
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    side = max(lens.width, lens.height)
-    if not (0 < lens.width <= MAX_SIDE and 0 < lens.height <= MAX_SIDE):
+    side = max(lens.size)
+    if not 0 < min(lens.size) <= side <= MAX_SIDE:
         raise InputError(f"{label} has the size {lens.width} x {lens.height}; make the model again.")
-    if not all(math.isfinite(v) for v in values):
+    if not all(map(math.isfinite, (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))):
         raise InputError(f"{label} has NaN or infinite parameters; make the model again.")
     for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
         if not side / 50 < focal < side * 1000:
@@ -122,11 +121,8 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
         raise InputError(f"{label} must be a 4 x 4 or 3 x 4 matrix, not {matrix.shape}.")
     if not np.isfinite(matrix).all():
         raise InputError(f"{label} holds NaN or infinity; remove the frame or repair its pose.")
-    if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
-        raise InputError(
-            f"{label} is {np.abs(matrix[:3, 3]).max():.1g} units from the origin; remove the frame or repair "
-            "its pose."
-        )
+    if (far := np.abs(matrix[:3, 3]).max()) > MAX_COORDINATE:
+        raise InputError(f"{label} is {far:.1g} units from the origin; remove the frame or repair its pose.")
     rotation = matrix[:3, :3].astype(np.float64)
     u, stretch, vt = np.linalg.svd(rotation)
     if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(rotation) < 0:
@@ -138,12 +134,10 @@ def check_layout(scene: Scene) -> None:
     """Refuse scenes that no frame of reference can be made for, and names that are there twice."""
     if len(scene.frames) < 2:
         raise InputError(f"{scene.model} has {len(scene.frames)} camera(s), and 2 are needed: add photos.")
-    problems = Problems()
-    for name, times in Counter(frame.name for frame in scene.frames).items():
-        if times > 1:
-            many = "twice" if times == 2 else f"{times} times"
-            problems.append(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
-    problems.raise_if_any()
+    counts = Counter(frame.name for frame in scene.frames)
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        raise InputError(*(f"{scene.model} names the photo {n} twice; keep one pose of it." for n in twice))
     centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
     if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():
         raise InputError(f"{scene.model} has all cameras at one place; add photos from other places.")

@@ -32,14 +32,13 @@ class SplitLists:
 def split_lists(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], labels: Mapping[str, str]
 ) -> SplitLists | None:
-    """The lists that there are as one split; None without any.
-
-    What is held out is val and test together. If only one side is listed, the other is all the rest.
+    """The lists that there are as one split; None without any. What is held out is val and test together. If
+    only one side is listed, the other is all the rest.
 
     Args:
-        found: what each list names, by split.
+        found: by split, what its list names.
         known: the name of each frame, by what lists call it.
-        labels: what each list is called in messages, by split.
+        labels: by split, what messages call its list.
     """
     if not found:
         return None
@@ -54,14 +53,12 @@ def split_lists(
     listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
     train = listed.get("train", everything - held_out)
-    if not held_out and not {"val", "test"} & listed.keys():
+    if listed.keys() == {"train"}:
         held_out = everything - train
-    for side, names in (("train on", train), ("hold out", held_out)):
-        if not names:
-            problems.append(
-                f"{next(iter(labels.values()))} leaves nothing to {side}; set {OPTION}eval-mode interval."
-            )
-    problems.raise_if_any()
+    if not (train and held_out):
+        side = "hold out" if train else "train on"
+        fix = f"set {OPTION}eval-mode interval"
+        raise InputError(f"{next(iter(labels.values()))} leaves nothing to {side}; {fix}.")
     return SplitLists(train, held_out)
 
 

@@ -36,14 +36,8 @@ _UNREAD = (
 
 
 def read_transforms(path: Path) -> Scene:
-    """The scene of a transforms.json file.
-
-    Args:
-        path: the file; all paths in it are relative to its folder and stay inside.
-
-    Returns:
-        The scene in the file's world. Frames are sorted by file_path.
-    """
+    """The scene of a transforms.json file, in its world; all paths in it are relative to its folder and stay
+    inside."""
     meta = _load(path)
     root, problems, frames = path.parent, Problems(), []
     files = FileFinder(root, path)
@@ -58,9 +52,9 @@ def read_transforms(path: Path) -> Scene:
         given = _matrix(meta.get("applied_transform", np.eye(4)), path)
         transform = rigid(given, f"{path}: applied_transform")
     with problems.collect():
-        scale = _number(meta, "applied_scale", str(path), default=1.0)
+        scale = _number(meta, "applied_scale", path, default=1.0)
         if scale <= 0:
-            problems.append(f"{path}: applied_scale is {scale:g}; it must be positive.")
+            raise InputError(f"{path}: applied_scale is {scale:g}; it must be positive.")
     problems.raise_if_any()
     called = {os.path.normpath(e["file_path"]): f.name for e, f in zip(meta["frames"], frames, strict=True)}
     folder, frames = _photo_folder(root, frames)
@@ -74,15 +68,16 @@ def read_split_transforms(folder: Path) -> Scene:
     be in one world, with the points of the first. Its frames are named from `folder` on."""
     paths = [folder / f"{TRANSFORMS}_{split}.json" for split in ("train", "test", "val")]
     scenes = [read_transforms(path) for path in [path for path in paths if path.exists()][:2]]
-    train, lists = scenes[0], []
+    train, frames, names = scenes[0], [], []
     for scene in scenes:
         same = np.array_equal(train.applied_transform, scene.applied_transform)
         if not same or train.applied_scale != scene.applied_scale:
             raise InputError(f"{scene.model} and {train.model} need the same applied_transform; make both.")
         at = os.path.relpath(scene.photo_folder, folder)
-        lists.append([replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames])
-    frames = sorted((frame for frames in lists for frame in frames), key=lambda frame: frame.name)
-    names = [frozenset(frame.name for frame in frames) for frames in lists]
+        found = [replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames]
+        names.append(frozenset(frame.name for frame in found))
+        frames += found
+    frames.sort(key=lambda frame: frame.name)
     split = SplitLists(*names) if len(names) > 1 else None
     return replace(train, photo_folder=folder, frames=frames, split_lists=split)
 
@@ -113,14 +108,14 @@ def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folde
             raise InputError(f"{path}: {key} must be a list of file_paths.")
         if key in meta:
             found[split] = [os.path.normpath(name) for name in listed]
+    photos = called.values()
     # As for the frames' own file_paths, the ending may be left out.
-    called = {photo.removesuffix(".png"): photo for photo in called.values()} | called
+    called = {photo.removesuffix(".png"): photo for photo in photos} | called | {p: p for p in photos}
     known = {call: os.path.relpath(photo, folder) for call, photo in called.items()}
-    known |= {photo: os.path.relpath(photo, folder) for photo in called.values()}
     return split_lists(found, known, {split: f"{path}: {split}_filenames" for split in found})
 
 
-def _number(values: dict[str, Any], key: str, label: str, default: float | None = None) -> float:
+def _number(values: dict[str, Any], key: str, label: object, default: float | None = None) -> float:
     """values[key] as a finite float."""
     value = values.get(key, default)
     # Compared rather than converted: JSON's whole numbers may be larger than any float.
@@ -155,13 +150,11 @@ def _frame(path: Path, files: FileFinder, meta: dict, entry: dict, number: int) 
 
 def _camera_values(meta: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
     """What a frame says of its camera, and what the file says where the frame does not."""
-    values = dict(meta)
+    hidden = set()
     for spellings in _SPELLINGS:
-        own = [keys for keys in spellings if not entry.keys().isdisjoint(keys)]
-        for keys in spellings if own else ():
-            if keys not in own:
-                values = {key: value for key, value in values.items() if key not in keys}
-    return values | entry
+        if any(key in entry for keys in spellings for key in keys):
+            hidden.update(*(keys for keys in spellings if entry.keys().isdisjoint(keys)))
+    return {key: value for key, value in meta.items() if key not in hidden} | entry
 
 
 def _lens(values: dict[str, Any], label: str, photo: Path) -> Lens:
@@ -216,8 +209,8 @@ def _photo_folder(root: Path, frames: list[Frame]) -> tuple[Path, list[Frame]]:
 
     Reduced copies lie beside that folder: images and images_4.
     """
-    tops = {Path(frame.name).parts[0] for frame in frames}
-    if len(tops) != 1 or any(len(Path(frame.name).parts) < 2 for frame in frames):
+    tops = {frame.name.partition(os.sep)[0] for frame in frames}
+    if len(tops) > 1 or any(os.sep not in frame.name for frame in frames):
         return root, frames
     top = tops.pop()
-    return root / top, [replace(f, name=str(Path(f.name).relative_to(top))) for f in frames]
+    return root / top, [replace(f, name=os.path.relpath(f.name, top)) for f in frames]

@@ -11,8 +11,6 @@ from abcd_ns.data.scene import Lens
 
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """OpenCV puts pixel centres at whole numbers; Lens puts them at +0.5."""
-
-
 _MAX_ZOOM = 10.0
 """How much the focal length may change; real lenses, fisheyes too, stay well below."""
 
@@ -58,13 +56,8 @@ def undistortion(lens: Lens) -> Undistortion:
     else:
         new, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(K, coefficients, lens.size, 0)
     zoom = np.array([new[0, 0] / lens.fx, new[1, 1] / lens.fy])
-    if not (
-        np.isfinite(new).all()
-        and (zoom > 1 / _MAX_ZOOM).all()
-        and (zoom < _MAX_ZOOM).all()
-        and 2 * width > lens.width
-        and 2 * height > lens.height
-    ):
+    is_mild = np.isfinite(new).all() and 1 / _MAX_ZOOM < zoom.min() <= zoom.max() < _MAX_ZOOM
+    if not (is_mild and 2 * width > lens.width and 2 * height > lens.height):
         raise _unusable(lens)
     new = new + _HALF_PIXEL
     pinhole = Lens(width, height, new[0, 0], new[1, 1], new[0, 2] - x, new[1, 2] - y)

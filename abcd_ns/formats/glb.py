@@ -9,7 +9,6 @@ import json
 import struct
 from collections.abc import Iterable
 from itertools import accumulate
-from math import isqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,27 +35,24 @@ _SPARE = 256
 
 
 class Attribute(NamedTuple):
-    """What each Gaussian has."""
+    """What each Gaussian has, in `stride` bytes."""
 
     name: str
     kind: str
     stride: int
-    """Bytes a Gaussian."""
     component: int = _FLOAT
 
 
 def attributes(sh_degree: int) -> list[Attribute]:
     """In the order of the file."""
+    harmonics = [f"SH_DEGREE_{n}_COEF_{k}" for n in range(sh_degree + 1) for k in range(2 * n + 1)]
     return [
         Attribute("POSITION", "VEC3", 12),
         Attribute("COLOR_0", "VEC4", 4, _BYTE),
         Attribute(f"{EXTENSION}:ROTATION", "VEC4", 16),
         Attribute(f"{EXTENSION}:SCALE", "VEC3", 12),
         Attribute(f"{EXTENSION}:OPACITY", "SCALAR", 4),
-        *(
-            Attribute(f"{EXTENSION}:SH_DEGREE_{isqrt(k)}_COEF_{k - isqrt(k) ** 2}", "VEC3", 12)
-            for k in range((sh_degree + 1) ** 2)
-        ),
+        *(Attribute(f"{EXTENSION}:{name}", "VEC3", 12) for name in harmonics),
     ]
 
 
@@ -87,15 +83,11 @@ def write_glb(
     parts: Iterable[Gaussians],
     antialiased: bool = False,
 ) -> None:
-    """Write Gaussians as they come, `count` in all.
+    """Write Gaussians as they come, `count` in all, unless UserError says that one file cannot hold them.
 
     Args:
-        up: turns the frame that the Gaussians are in, so that y is up. A node of the file says it: the
-            values stay those of that frame.
+        up: turns the Gaussians' frame so that y is up. A node of the file has it; values stay as they are.
         antialiased: noted in the extras of the primitive; the extension has no field for it.
-
-    Raises:
-        UserError: they are too many for one file.
     """
     columns = attributes(sh_degree)
     starts = list(accumulate((column.stride * count for column in columns), initial=0))

@@ -27,14 +27,8 @@ def check_installed() -> None:
 def packed(
     count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians], antialiased: bool = False
 ) -> bytes:
-    """A file of Gaussians, `count` in all, once all are there.
-
-    Args:
-        kind: "spz", "sog" or "compressed.ply".
-
-    Raises:
-        UserError: the package cannot write them.
-    """
+    """A file of `count` Gaussians; `kind` is "spz", "sog" or "compressed.ply". UserError says that it
+    cannot be written."""
     import gaussforge
 
     table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0
@@ -61,10 +55,9 @@ def _marked(data: bytes, kind: str) -> bytes:
         return gzip.compress(content, mtime=0)
     made = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            if name == "meta.json":
-                content = json.dumps({**json.loads(content), "antialias": True}).encode()
+        files = {name: old.read(name) for name in old.namelist()}
+        files["meta.json"] = json.dumps({**json.loads(files["meta.json"]), "antialias": True})
+        for name, content in files.items():
             new.writestr(name, content)
     return made.getvalue()
 

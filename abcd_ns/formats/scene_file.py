@@ -30,14 +30,8 @@ def shows(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, "n"]:
 
 
 def suffix_of(path: Path, missing: str | None = None) -> str:
-    """Which of SUFFIXES the path has; what begins with a dot and has no letters before it has none.
-
-    Args:
-        missing: what a path without any suffix has.
-
-    Raises:
-        UserError: it has another, or the package that writes it is not there.
-    """
+    """Which of SUFFIXES the path has, or else `missing`. UserError says that there is none, or that the
+    package that writes it is not there."""
     found = next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), missing)
     if found is None:
         raise UserError(f"--out {path} must end in one of {', '.join(sorted(SUFFIXES))}.")
@@ -47,11 +41,8 @@ def suffix_of(path: Path, missing: str | None = None) -> str:
 
 
 def rounding(suffix: str, largest: float) -> float:
-    """By how much positions may be off whose largest coordinate is this.
-
-    Raises:
-        UserError: the format cannot hold it.
-    """
+    """By how much positions may be off whose largest coordinate is this; UserError where the format cannot
+    hold it."""
     if suffix != ".spz":
         return largest * torch.finfo(torch.float32).eps
     if largest >= SPZ_REACH:
@@ -71,11 +62,9 @@ def write_scene(
     parts: Iterable[Gaussians],
     antialiased: bool = False,
 ) -> None:
-    """Write Gaussians as they come.
+    """Write Gaussians as they come, `count` in all, in the format of a suffix.
 
     Args:
-        suffix: of SUFFIXES.
-        count: how many there are in all parts; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
         antialiased: mark the file so: its opacities are to be compensated for the low-pass filter.
     """
