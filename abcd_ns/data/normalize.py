@@ -50,7 +50,7 @@ class Similarity:
 def normalizing_similarity(
     poses: np.ndarray, orientation: Orientation, center: Center, auto_scale: bool, scale_factor: float
 ) -> Similarity:
-    """The frame that nerfstudio's auto_orient_and_center_poses and auto_scale_poses choose for `poses`, camera
+    """The frame that nerfstudio's auto_orient_and_center_poses and auto_scale_poses choose for poses, camera
     to world, float64 [n, 3, 4], OpenGL convention.
 
     nerfstudio works in float32, where geo-referenced coordinates (1e6 m) have lost half a metre. So the

@@ -10,8 +10,7 @@ tile space. In this engine's terms, for every step:
 
 By fragments the picture is the merged one, so this is 3DGS step for step, but for the 1e-4 of light at which
 drawing stops. The device holds one block at a time and what reaches into its cell, and the step's layers; all
-blocks with moments and gradients lie in RAM. It costs one more drawing than joint training, and every block's
-way to the device and back.
+blocks with moments and gradients lie in RAM.
 """
 
 from collections.abc import Iterator, Sequence
@@ -58,17 +57,6 @@ class Gradients:
     sums: Float[Tensor, "v n 10"]
     """By view, see ResidualSums; density control judges by it."""
 
-    @staticmethod
-    def zero(gaussians: Gaussians, views: int) -> "Gradients":
-        """Nothing yet."""
-        params = {name: torch.zeros_like(value) for name, value in gaussians.items()}
-        return Gradients(params, gaussians.means.new_zeros(views, len(gaussians), SUMS))
-
-    def add(self, rows: Int64[Tensor, "m"], view: int, raster: Raster) -> None:
-        """Take over what one drawing's backward left in its info; `rows` are its Gaussians."""
-        if "sums" in raster.info and raster.info["sums"].values is not None:
-            self.sums[view].index_add_(0, rows, raster.info["sums"].values[0].to(self.sums))
-
 
 class ExactTrainer(Trainer):
     """Every step trains all blocks.
@@ -91,7 +79,6 @@ class ExactTrainer(Trainer):
 
     @property
     def batch(self) -> int:
-        """Views in a step."""
         return views_per_step(self.config.batch, 1)
 
     def next_batch(self) -> Batch:
@@ -120,12 +107,9 @@ class ExactTrainer(Trainer):
                 for place in range(len(batch.samples)):
                     self._layers_of[place][block] = self._draw(block, gaussians, place).layer
         wholes = [fold(self._in_order(place)) for place in range(len(batch.samples))]
-        self._pictures = [
-            composite(whole, sample.background).requires_grad_()
-            for whole, sample in zip(wholes, batch.samples, strict=True)
-        ]
-        clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
-        return Rendered(clamped, tuple(wholes), ())
+        pairs = zip(wholes, batch.samples, strict=True)
+        self._pictures = [composite(whole, sample.background).requires_grad_() for whole, sample in pairs]
+        return Rendered(tuple(picture.clamp(0, 1) for picture in self._pictures), tuple(wholes), ())
 
     def loss(
         self,
@@ -160,20 +144,21 @@ class ExactTrainer(Trainer):
 
     def gradients(self) -> Gradients:
         """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given."""
-        gradients = Gradients.zero(self._all.gaussians, len(self._pictures))
+        everything, views = self._all.gaussians, len(self._pictures)
+        params = {name: torch.zeros_like(value) for name, value in everything.items()}
+        sums = everything.means.new_zeros(views, len(everything), SUMS)
         for block, rows, gaussians in self._cells():
             leaves = Gaussians(**{name: v.detach().requires_grad_() for name, v in gaussians.items()})
-            for place in range(len(self._pictures)):
-                raster = self._draw(block, leaves, place)
-                self._backward(block, place, raster)
-                gradients.add(rows, place, raster)
+            for place in range(views):
+                found = self._backward(block, place, self._draw(block, leaves, place))
+                if found is not None:
+                    sums[place].index_add_(0, rows, found.to(sums))
             for name, leaf in leaves.items():
                 if leaf.grad is not None:
-                    gradients.params[name].index_add_(0, rows, leaf.grad.to("cpu"))
-        return gradients
+                    params[name].index_add_(0, rows, leaf.grad.to("cpu"))
+        return Gradients(params, sums)
 
     def count(self) -> int:
-        """Gaussians in the whole scene."""
         return len(self._all)
 
     def persist(self, within: float) -> None:
@@ -183,15 +168,14 @@ class ExactTrainer(Trainer):
         self.run.persist(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
     def restore(self) -> None:
-        """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""
+        """As the base's, the order of the Gaussians aside."""
         self.run.restore()
         self._take()
 
     # -- blocks --------------------------------------------------------------------------------------
 
     def _take(self) -> None:
-        blocks = range(self.scene.tree.num_blocks)
-        self._all = join([self.scene.state(block) for block in blocks])
+        self._all = join([self.scene.state(block) for block in range(self.scene.tree.num_blocks)])
 
     def _owner_of_all(self) -> Int64[Tensor, "n"]:
         return self.scene.tree.assign(self._all.gaussians.means)
@@ -213,12 +197,8 @@ class ExactTrainer(Trainer):
         grid = self.run.rasterizer.window_grid(sample.crop)
         window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
-        options = {
-            "sh_degree": self._degree,
-            "antialiased": self.config.antialiased,
-            "residual_sums": self._asks,
-        }
-        return self.run.rasterizer.draw(gaussians, [shot], **options)[0]
+        options = {"antialiased": self.config.antialiased, "residual_sums": self._asks}
+        return self.run.rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:
         """The view's layers, front to back."""
@@ -226,14 +206,17 @@ class ExactTrainer(Trainer):
         layers = self._layers_of[place]
         return [layers[block] for block in order if block in layers]
 
-    def _backward(self, block: int, place: int, raster: Raster) -> None:
+    def _backward(self, block: int, place: int, raster: Raster) -> Float[Tensor, "m 10"] | None:
+        """Backward through one drawing; gives what density control judges by, if anything."""
         layers, own = self._in_order(place), self._layers_of[place][block]
         at = next(k for k, layer in enumerate(layers) if layer is own)
         front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
-        if "sums" in raster.info:
-            raster.info["sums"].ask([seen_behind(self._residuals[place], front.transmittance)])
+        sums = raster.info.get("sums")
+        if sums is not None:
+            sums.ask([seen_behind(self._residuals[place], front.transmittance)])
         picture = sandwich(front, raster.layer, back, self._batch.samples[place].background)
         picture.backward(self._pictures[place].grad)
+        return None if sums is None or sums.values is None else sums.values[0]
 
     def _step(
         self, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int
@@ -246,14 +229,9 @@ class ExactTrainer(Trainer):
         steps, views = state.clocks.steps + taken, state.clocks.adam_views + taken
         clocks = replace(state.clocks, steps=steps, adam_views=views)
         clock = self._clock_of(len(state), clocks, taken)
-        growth, refined = self.run.density.after_step(
-            self.params,
-            self.optimizers,
-            {name: value.to(self.device) for name, value in state.growth.items()},
-            (),
-            self._judged(gradients.sums[:, rows]),
-            clock,
-        )
+        growth = {name: value.to(self.device) for name, value in state.growth.items()}
+        judged = self._judged(gradients.sums[:, rows])
+        growth, refined = self.run.density.after_step(self.params, self.optimizers, growth, (), judged, clock)
         if refined:
             clocks = replace(clocks, refined=clock.steps)
         stepped = detach(self.params, self.optimizers, growth, clocks)

@@ -52,9 +52,9 @@ SURFACE_SCALE = 0.5
 BEYOND = 1e30
 """Camera z of a pixel that shows no point: further than any finite cell."""
 OWN, CLEAR = 1, 2
-"""What a pixel is to a block, by where its surface lies. In the enlarged cell: the photo is the block's to
-explain. Behind it, or the ray misses the cell: the block must let all light through. Any other is 0: the cell
-lies behind the surface, and nobody can tell what is there."""
+"""What a pixel is to a block, by where its surface lies. In the enlarged cell: the block explains the photo.
+Behind it, or the ray misses the cell: the block must let all light through. Any other is 0: the cell lies
+behind the surface, and nothing tells what is there."""
 
 
 def independent_blocks(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[BlockName, Packed]]:
@@ -64,12 +64,8 @@ def independent_blocks(tree: BlockTree, start: Gaussians | PointCloud) -> Iterat
 
 
 def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
-    """The cell, moved outward at each face by `overlap` of its extent on that axis.
-
-    Args:
-        means: of the cell's Gaussians; where the cell is infinite, its extent is theirs, a twentieth at
-            either end left out.
-    """
+    """The cell, moved outward at each face by `overlap` of its extent on that axis. Where that is infinite, its
+    Gaussians' means stand for it, a twentieth at either end left out."""
     extent = cell.upper - cell.lower
     if len(means):
         low, high = torch.from_numpy(np.quantile(means.double().cpu().numpy(), (0.05, 0.95), axis=0))
@@ -79,10 +75,7 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
 
 
 class Surfaces:
-    """How far the initial points are at every pixel of every view; 4 bytes of RAM for each.
-
-    All initial Gaussians are drawn at once to find out.
-    """
+    """How far the initial points are at every pixel of every view, drawn at once; 4 bytes of RAM for each."""
 
     def __init__(self, scene: StoredScene, views: list[View], rasterizer: Rasterizer, device: torch.device):
         self._views = {view.index: view for view in views}
@@ -124,7 +117,7 @@ class BlocksAlone(Visits):
         self._looked_at: int | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
-        """The next block's one visit; the block is persisted as it begins, with what lies around it."""
+        """The next block's one visit; the block is persisted with what lies around it."""
         run, state = self._run, self._run.state
         began, since = run.stopwatch.seconds, run.progress
         if not state.views:
@@ -164,9 +157,9 @@ class BlocksAlone(Visits):
 
     def room(self) -> int | None:
         """The block's part of the scene's limit, and what the device leaves."""
-        config = self._run.config
-        limits = [config.limits.sole_limit] if config.limits.sole_limit else []
-        limits += [int(config.density.limit * self._part)] if config.density.limit is not None else []
+        sole, whole = self._run.config.limits.sole_limit, self._run.config.density.limit
+        limits = [sole] if sole else []
+        limits += [] if whole is None else [int(whole * self._part)]
         return min(limits) - len(self._run.params["means"]) if limits else None
 
     def compared(
@@ -192,7 +185,7 @@ class BlocksAlone(Visits):
         state = self._run.state
         for block in self._blocks:
             self._look(block)
-            owns = any(bool((region == OWN).any()) for region in self._regions.values())
+            owns = any(OWN in region for region in self._regions.values())
             state.views[block] = len(self._regions) if owns else 0
         state.queue = list(plan_epoch(0, state.views, 1, None, self._run.config.seed))
         if not state.queue:
