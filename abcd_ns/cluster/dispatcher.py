@@ -65,12 +65,8 @@ class InFlight:
 
 
 class Dispatcher(Coordinator):
-    """Assigns blocks to workers; what cannot be assigned, the warm-up, it trains as a coordinator does.
-
-    Args:
-        lag: see above; None takes SLACK for each worker. Fewer where there are fewer blocks.
-        room, target: see Coordinator.
-    """
+    """Assigns blocks to workers; what cannot be assigned, the warm-up, it trains as a coordinator does. A
+    `lag` of None is SLACK for each worker, and fewer where there are fewer blocks."""
 
     def __init__(
         self,
@@ -97,12 +93,8 @@ class Dispatcher(Coordinator):
         return state.active is None and not warms_up
 
     def await_step(self) -> None:
-        """Return when one more step was taken in, or the run is finished.
-
-        Raises:
-            NothingSeenError: no view sees any block.
-            WorkersError: there are no workers, or a visit lost LOSSES of them.
-        """
+        """As the trainer's. NothingSeenError says that no view sees any block, WorkersError that there are no
+        workers, or that a visit lost LOSSES of them."""
         if not self._shown and self.device.type == "cuda":
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
@@ -130,7 +122,6 @@ class Dispatcher(Coordinator):
         super().resume()
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """As the coordinator's, for a step that was taken here."""
         super().after_step(rendered, errors)
         self._counted = self.state.step
 

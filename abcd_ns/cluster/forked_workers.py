@@ -80,11 +80,7 @@ class Place(Member):
 
 
 class ForkedWorkers(Workers):
-    """So many processes at most at a time.
-
-    Args:
-        worker: trains a visit, in a process of its own.
-    """
+    """So many processes at most at a time, in each of which `worker` trains a visit."""
 
     def __init__(self, count: int, worker: VisitWorker) -> None:
         self._worker, self._owner, now = worker, os.getpid(), time.monotonic()

@@ -81,12 +81,8 @@ class Actor:
         self._done, self._psnr = 0, math.nan
 
     def prepare(self, version: str, make: bytes) -> int:
-        """Read what the run needs; gives the process' identifier.
-
-        Args:
-            version: of abcd_ns where the run was started.
-            make: makes the worker; pickled, as another version may not even read it.
-        """
+        """Read what the run needs; gives the process' identifier. `version` is of abcd_ns where the run was
+        started. `make` is pickled: another version may not even read it."""
         if version != (own := _version()):
             same = "install the same on all machines"
             raise WorkersError(f"abcd_ns here is {own}, and {version} where the run was started: {same}.")

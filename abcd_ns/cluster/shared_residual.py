@@ -43,13 +43,8 @@ def shares(
 def shown_beside(
     influence: Influence, block: int, others: Collection[int], blocks: int, views: Sequence[int]
 ) -> dict[int, float]:
-    """By view, which part of the other blocks' weight is in flight at the same time; views that show none of
-    these are left out.
-
-    Args:
-        others: blocks in flight.
-        blocks: how many there are. Where influences are not known, all weigh the same.
-    """
+    """By view, which part of the other blocks' weight is in flight at the same time, in `others`; views that
+    show none of these are left out. Where influences are not known, all of the `blocks` weigh the same."""
     found = {}
     for view in views:
         shown = {b: known.get(view, 0.0) for b, known in influence.items() if b != block}

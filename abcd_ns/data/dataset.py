@@ -28,14 +28,9 @@ _BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 
 class AbcdDataset(InputDataset):
-    """The photos that a dataparser found, at the size of their cameras and without distortion.
-
-    Args:
-        dataparser_outputs: of AbcdDataParser or any of nerfstudio's.
-        scale_factor: 1; splatfacto's datamanager passes it.
-        budget_bytes: see Photos.
-        needs_photos: see `with_photos`.
-    """
+    """The photos that a dataparser, ours or any of nerfstudio's, found: at the size of their cameras and
+    without distortion. See `Photos` and `with_photos`; splatfacto's datamanager passes a `scale_factor` of
+    1."""
 
     def __init__(
         self,
@@ -67,10 +62,7 @@ def has_views(outputs: DataparserOutputs) -> bool:
 
 def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> DataparserOutputs:
     """The same with PHOTOS, and with the cameras of photos that are undistorted; our own reader's unchanged.
-
-    Args:
-        needs_photos: False for viewing and exporting, which look at no file.
-    """
+    Viewing and exporting, which look at no file, do without `needs_photos`."""
     if PHOTOS in outputs.metadata:
         return outputs
     if outputs.metadata.get("mask_color") is not None:

@@ -43,12 +43,9 @@ def exit_on_user_error() -> Iterator[None]:
 
 
 class InputError(UserError):
-    """The input cannot be used; a command shows `str(error)` alone and exits with code 2.
-
-    Args:
-        lines: what is wrong, each a sentence that names the file or value and the fix; `lines` keeps all,
-            `str(error)` has the first SHOWN and counts the rest.
-    """
+    """The input cannot be used; a command shows `str(error)` alone and exits with code 2. Each line is a
+    sentence that names the file or value and the fix; `str(error)` has the first SHOWN and counts the
+    rest."""
 
     def __init__(self, *lines: str):
         self.lines = tuple(one_line(line) for line in lines)
@@ -66,11 +63,8 @@ class Problems(list[str]):
 
     @contextmanager
     def collect(self, label: str = "", name: str = "") -> Iterator[None]:
-        """Note the InputError that the body raises, if any, each line after the label, and continue.
-
-        Args:
-            name: what the body is about; lines that are equal but for it become one if they are many.
-        """
+        """Note the InputError that the body raises, if any, each line after the label, and continue. Lines
+        that are equal but for `name` become one if they are many."""
         try:
             yield
         except InputError as error:

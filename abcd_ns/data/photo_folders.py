@@ -24,10 +24,8 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
 
     images_N (N = `factor`) is used where every photo is there in W/N x H/N, rounded either way. Otherwise
     the full photos are reduced to floor(W/N) x floor(H/N). Where there are no full photos, the least
-    reduced copies that can serve are taken.
-
-    Returns:
-        (one source per frame, without undistortion and mask; notes for the user).
+    reduced copies that can serve are taken. Gives one source per frame, without undistortion and mask, and
+    notes for the user.
     """
     full = scene.photo_folder
     copies = _reduced_folders(scene)
@@ -67,9 +65,7 @@ def _hint(scene: Scene) -> str:
 
 def as_stored(scene: Scene) -> Scene:
     """The scene with cameras of the photos' size, where all photos are the same share of what cameras say.
-
-    The first photo is looked at; only if it has another size than its camera, so are all.
-    """
+    The first photo is looked at; only if it has another size than its camera, so are all."""
     finder, sizes = FileFinder(scene.photo_folder, scene.model), []
     for frame in scene.frames:
         try:

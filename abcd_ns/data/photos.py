@@ -63,10 +63,8 @@ def default_budget() -> int:
 class Photos:
     """The photos of a set of cameras. Safe to use from several threads.
 
-    Pixels depend on the sources alone: not on the budget, nor on the order of calls.
-
     Args:
-        sources: one per camera.
+        sources: one per camera; pixels depend on these alone.
         budget_bytes: how much decoded pixels may stay in memory between calls; None means
             `default_budget()`. With 0 every call reads the file.
     """
@@ -103,10 +101,8 @@ class Photos:
                 self._expect(("mask", index))
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
-        """Which pixels count, or None where the photo has no mask. Do not write to it.
-
-        A reduced or undistorted pixel counts only if all pixels that it is made of count.
-        """
+        """Which pixels count, or None where the photo has no mask. Do not write to it. A reduced or
+        undistorted pixel counts only if all pixels that it is made of count."""
         return self._get(("mask", index)) if self.sources[index].mask_path else None
 
     def _read(self, key: _Key) -> Tensor:

@@ -44,12 +44,8 @@ def check_regular(path: Path, kind: str = "photo") -> None:
 
 
 class FileFinder:
-    """Finds files of a folder by what another file calls them, as written on another machine perhaps.
-
-    Args:
-        folder: no path leads out of it. The check is by name: a link inside may point anywhere.
-        said_by: the file that names them, for messages.
-    """
+    """Finds files of a folder by what another file, `said_by`, calls them, as written on another machine
+    perhaps. No path leads out of the folder. The check is by name: a link inside may point anywhere."""
 
     def __init__(self, folder: Path, said_by: Path):
         self.folder, self.said_by = folder, said_by
@@ -57,11 +53,8 @@ class FileFinder:
 
     def find(self, name: str, moved: bool = True) -> Path:
         """The file of that name; or else the only one that differs in separators, case, Unicode form or a
-        picture's ending; or else the path as it is named.
-
-        Args:
-            moved: the folders that come first in the name may be missing, as those of another machine.
-        """
+        picture's ending; or else the path as it is named. If `moved`, the folders that come first in the name
+        may be missing, as those of another machine."""
         try:
             os.fsencode(name)
         except UnicodeEncodeError:

@@ -146,10 +146,7 @@ def _advice(data: Path) -> str:
 
 def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     """Read the model, look at the header and the end of every photo, and place the scene in its frame.
-
-    Args:
-        needs_photos: False for viewing and exporting, which go on without.
-    """
+    Viewing and exporting do without `needs_photos`."""
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"{DOWNSCALE} is {wanted}; it must be a whole number from 1.")

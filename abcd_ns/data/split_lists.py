@@ -64,10 +64,7 @@ def split_lists(
 
 def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
     """The split of train_list.txt, val_list.txt and test_list.txt in `data`: a photo's name in each line.
-
-    Args:
-        known: the name of each frame, by what the model calls it.
-    """
+    `known` is the name of each frame, by what the model calls it."""
     found, labels = {}, {}
     for split in SPLITS:
         path = data / f"{split}_list.txt"

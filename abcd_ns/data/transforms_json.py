@@ -96,11 +96,8 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folder: str) -> SplitLists | None:
-    """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it.
-
-    Args:
-        called: the photo of each file_path, from the data root on; frames are named from `folder` on.
-    """
+    """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it. `called`
+    has the photo of each file_path, from the data root on; frames are named from `folder` on."""
     found = {}
     for split in SPLITS:
         listed = meta.get(key := f"{split}_filenames", [])
@@ -205,10 +202,8 @@ def _coefficients(values: dict[str, Any], label: str) -> list[float]:
 
 
 def _photo_folder(root: Path, frames: list[Frame]) -> tuple[Path, list[Frame]]:
-    """The folder that all photos share, if it is one below the root, and frames named relative to it.
-
-    Reduced copies lie beside that folder: images and images_4.
-    """
+    """The folder that all photos share, if it is one below the root, and frames named relative to it. Reduced
+    copies lie beside that folder: images and images_4."""
     tops = {frame.name.partition(os.sep)[0] for frame in frames}
     if len(tops) > 1 or any(os.sep not in frame.name for frame in frames):
         return root, frames

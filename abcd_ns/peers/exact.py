@@ -59,11 +59,9 @@ class Gradients:
 
 
 class ExactTrainer(Trainer):
-    """Every step trains all blocks.
-
-    `render` gives pictures whose gradient the caller's backward takes; `after_step` hands it on to blocks.
-    Between steps the run's parameters are empty, so that the caller's optimizers have nothing to step.
-    """
+    """Every step trains all blocks: `render` gives pictures whose gradient the caller's backward takes, and
+    `after_step` passes it to blocks. Between steps the run's parameters are empty, so that the caller's
+    optimizers have nothing to step."""
 
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)

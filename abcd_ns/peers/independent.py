@@ -64,8 +64,8 @@ def independent_blocks(tree: BlockTree, start: Gaussians | PointCloud) -> Iterat
 
 
 def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
-    """The cell, moved outward at each face by `overlap` of its extent on that axis. Where that is infinite, its
-    Gaussians' means stand for it, a twentieth at either end left out."""
+    """The cell, moved outward at each face by `overlap` of its extent on that axis. Where that is infinite,
+    its Gaussians' means stand for it, a twentieth at either end left out."""
     extent = cell.upper - cell.lower
     if len(means):
         low, high = torch.from_numpy(np.quantile(means.double().cpu().numpy(), (0.05, 0.95), axis=0))

@@ -26,10 +26,8 @@ def fsync_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
-    """Give a temporary path to write to; on leaving, sync it and put it in place of `path`.
-
-    Args:
-        folder: of the temporary file, on the disk of `path`; None is that of `path`.
+    """Give a temporary path to write to, in `folder` or beside `path`; on leaving, sync it and put it in
+    place.
 
     If anything fails, `path` is what it was and the temporary file is gone. The new name survives a
     power loss only after `fsync_folder(path.parent)`, so that several files can share one such call.
@@ -71,11 +69,7 @@ class FolderLockedError(UserError):
 
 class FolderLock:
     """The right to write in an existing folder: of one object of one process, and freed when that dies.
-
-    Raises:
-        FolderLockedError: someone holds it.
-        OSError: the folder cannot be written to.
-    """
+    FolderLockedError says that another one holds it, OSError that the folder is not writable."""
 
     def __init__(self, folder: Path):
         descriptor = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)

@@ -43,11 +43,8 @@ class BlockMemory:
             kept.pop(name, None)
 
     def shrink(self, spare: int = 0) -> None:
-        """Let go of what goes beyond the limit; the Gaussians used last stay in any case.
-
-        Args:
-            spare: bytes that are taken otherwise and count against the limit.
-        """
+        """Let go of what goes beyond the limit, less `spare` bytes; the Gaussians used last stay in any
+        case."""
         beyond = self.nbytes + spare - self.limit
         while beyond > 0 and (self._training or len(self._drawn) > 1):
             _, gone = (self._training or self._drawn).popitem(last=False)

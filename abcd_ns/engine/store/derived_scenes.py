@@ -23,12 +23,8 @@ class _Derived(BlockScene):
 
 
 class ChangedScene(_Derived):
-    """A scene of which others see something else.
-
-    Args:
-        change: gives what is seen of a block, by its number and its Gaussians: as many or fewer, none of them
-            farther out, for numbers and bounds stay those of all.
-    """
+    """A scene of whose blocks `change` says what is seen, by number and Gaussians: as many or fewer, none of
+    them farther out, for counts and bounds stay those of all."""
 
     def __init__(self, scene: BlockScene, change: Callable[[int, Gaussians], Gaussians]) -> None:
         super().__init__(scene)
@@ -39,11 +35,8 @@ class ChangedScene(_Derived):
 
 
 class HeldScene(_Derived):
-    """A scene's blocks on a device, whole: read once, as far as there is room, while none of them changes.
-
-    Args:
-        room: bytes of those that are held.
-    """
+    """A scene's blocks on a device, whole: read once, as far as there is room, bytes, while none of them
+    changes."""
 
     def __init__(self, scene: BlockScene, device: torch.device, room: int) -> None:
         super().__init__(scene)

@@ -54,11 +54,8 @@ class Manifest:
 
     @staticmethod
     def from_bytes(data: bytes, path: Path) -> "Manifest":
-        """The manifest in `data`, which was read from `path`.
-
-        Raises:
-            StoreError: another format or version, or a single altered byte.
-        """
+        """The manifest in `data`, which was read from `path`; StoreError where its format or version is
+        another, or a single byte was altered."""
         try:
             envelope = json.loads(data)
         except ValueError as error:
@@ -95,11 +92,7 @@ def pin_names(folder: Path) -> list[str]:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """The manifest in a file.
-
-    Raises:
-        StoreError: missing, unreadable, of another format or damaged.
-    """
+    """The manifest in a file; StoreError where it is missing, unreadable, of another format or damaged."""
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:

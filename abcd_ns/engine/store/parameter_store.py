@@ -139,9 +139,6 @@ class ParameterStore:
         Args:
             names: of the tensors that are wanted; each file is checked once in the life of this object. None
                 for all, which are checked each time.
-
-        Raises:
-            KeyError: no such block.
         """
         while True:
             shard = self._shard(block)
@@ -173,8 +170,8 @@ class ParameterStore:
         are asked for one after another. None keeps the present header or state.
 
         Raises:
-            StoreError: a write failed, as on a full disk: the new files are gone, unless the disk refuses
-                even to put the old manifest back; `generation` tells.
+            StoreError: a write failed: the new files are gone, unless the disk refuses even to put the old
+                manifest back; `generation` tells.
             TypeError, ValueError: something is not JSON.
         """
         self._require_writable()
@@ -196,11 +193,8 @@ class ParameterStore:
         return generation
 
     def pin(self, name: str) -> None:
-        """Keep the present generation under `name`, in place of what had this name, until `unpin`.
-
-        Raises:
-            ValueError: the name has other characters than letters, digits, '_', '-' and '.'.
-        """
+        """Keep the present generation under `name`, in place of what had this name, until `unpin`; ValueError
+        as `manifest_path`."""
         self._require_writable()
         path = manifest_path(self.folder, name)
         try:
@@ -223,8 +217,8 @@ class ParameterStore:
     def restore(self, name: str) -> int:
         """Make what is pinned under `name` a new generation; return its number. The pin stays.
 
-        Blocks keep the versions they were pinned with. The number still grows, so that no version is ever
-        given to two different contents, and no block of the abandoned generations looks fresh.
+        Blocks keep the versions they were pinned with. The number grows, so that no version is ever given to
+        two different contents.
         """
         self._require_writable()
         pinned = read_checked_manifest(manifest_path(self.folder, name))
@@ -234,11 +228,9 @@ class ParameterStore:
         return self.generation
 
     def clone_to(self, folder: Path | str, name: str | None = None) -> None:
-        """Make `folder` a store that holds this generation, or the one pinned under `name`.
-
-        Shards are shared by hard links where the file system can, which costs no space, and copied
-        elsewhere. Shards are never written in place, so neither store changes the other.
-        """
+        """Make `folder` a store that holds this generation, or the one pinned under `name`. Shards are shared
+        by hard links where the file system can. They are never written in place, so neither store changes the
+        other."""
         folder = Path(folder)
         manifest = self._manifest
         if name is not None:
@@ -291,9 +283,7 @@ class ParameterStore:
 
     def _roll_back(self, old: Manifest) -> str:
         """Undo a commit that failed anywhere, even after its manifest came into place; say what is left.
-
-        Should the disk refuse that too, the manifest on disk decides; the shards of both are there.
-        """
+        Should the disk refuse that too, the manifest on disk decides; the shards of both are there."""
         path = manifest_path(self.folder)
         with suppress(OSError):
             if path.read_bytes() != old.to_bytes():

@@ -97,10 +97,8 @@ class MemoryScene(BlockScene):
 
 
 class StoredScene(VisitScene):
-    """A scene in a ParameterStore, read block by block, with the active block laid over it.
-
-    Blocks that were read stay in RAM, least recently used first out, within `ram_bytes`.
-    """
+    """A scene in a ParameterStore, read block by block, with the active block laid over it. Blocks that were
+    read stay in RAM, least recently used first out, within `ram_bytes`."""
 
     def __init__(self, tree: BlockTree, store: ParameterStore, ram_bytes: int = 2 << 30) -> None:
         self.tree = tree

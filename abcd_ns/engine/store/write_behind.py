@@ -43,11 +43,8 @@ class Snapshot:
 
 
 class WriteBehind:
-    """At most one snapshot is being written and one waits, which later ones are added to.
-
-    Args:
-        written: told of every snapshot that has become durable; on the thread, without the lock.
-    """
+    """At most one snapshot is being written and one waits, which later ones are added to. `written` is called
+    with each that has become durable, on the thread, without the lock."""
 
     def __init__(self, store: ParameterStore, written: Callable[[Snapshot], None]) -> None:
         self._store, self._written = store, written
