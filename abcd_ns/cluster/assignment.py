@@ -13,12 +13,14 @@ from torch import Tensor
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
-from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.assigned_scene import Outlines
+from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
+
+Drawn = Mapping[int, Callable[[], Gaussians]]
+"""By block, what reads its Gaussians as others draw them."""
 
 
 class WorkersError(UserError):
@@ -31,8 +33,9 @@ class VisitTask:
 
     active: ActiveVisit
     tree: BlockTree
-    outlines: Outlines
-    """Of all blocks, at the moment they are assigned."""
+    counts: list[int]
+    bounds: list[Box | None]
+    """See BlockScene; of all blocks, as the visit is assigned."""
     step: int
     """Steps of the run before the visit's first one."""
     seconds: float
@@ -94,8 +97,8 @@ class Assignment:
     task: VisitTask
     state: Callable[[], BlockState]
     """Reads what the visit begins with, wherever the worker is."""
-    drawn: Mapping[int, Callable[[], Gaussians]]
-    """Likewise all blocks, this one too, as others draw them."""
+    drawn: Drawn
+    """Likewise all blocks, this one too."""
 
 
 @dataclass(frozen=True)

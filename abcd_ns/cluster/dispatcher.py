@@ -29,7 +29,6 @@ from abcd_ns.cluster.assignment import (
 )
 from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
-from abcd_ns.engine.store.assigned_scene import Outlines
 from abcd_ns.engine.store.commit import commit, with_pending
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.coordinator import Coordinator, persist_after_visit
@@ -154,7 +153,8 @@ class Dispatcher(Coordinator):
         task = VisitTask(
             active=active,
             tree=scene.tree,
-            outlines=Outlines(*(list(map(known, blocks)) for known in (scene.count, scene.bounds))),
+            counts=[scene.count(number) for number in blocks],
+            bounds=[scene.bounds(number) for number in blocks],
             step=state.planned,
             seconds=self.stopwatch.seconds,
             epoch=state.epoch,
@@ -205,7 +205,7 @@ class Dispatcher(Coordinator):
                 self.workers.submit(visit.assignment)
                 visit.submitted, active, block = True, visit.active, visit.active.geometry.block
                 if not visit.losses:
-                    seen, gaussians = len(active.trained_on), now.outlines.counts[block]
+                    seen, gaussians = len(active.trained_on), now.counts[block]
                     self.announce(VisitBegan(active.number, now.epoch, block, active.steps, seen, gaussians))
 
     # -- taking in -----------------------------------------------------------------------------------

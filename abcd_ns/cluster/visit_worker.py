@@ -2,21 +2,24 @@
 
 import copy
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
 from torch.nn import Parameter
 
-from abcd_ns.cluster.assignment import VisitOutcome, VisitTask
+from abcd_ns.cluster.assignment import Drawn, VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import squared_errors
-from abcd_ns.engine.store.assigned_scene import AssignedScene
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.store.scene import VisitScene
+from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.layer_source import LayerRoom
@@ -48,6 +51,48 @@ class RunSetup:
         kept = ("lr", "betas", "eps")
         options = {name: {key: group[key] for key in kept} for name, group in groups.items()}
         return RunSetup(run.config, run.budget, list(run.views.values()), options, layer_room)
+
+
+class AssignedScene(VisitScene):
+    """The blocks of a moment: the assigned one with the state that its visit begins with, the others as they
+    are drawn, which `drawn` reads by block. What only an active block has is that of the assigned one."""
+
+    def __init__(self, task: VisitTask, state: BlockState, drawn: Drawn) -> None:
+        self.tree, self._task = task.tree, task
+        self._block, self._state = task.active.geometry.block, state
+        self._drawn = {number: cache(read) for number, read in drawn.items()}
+        self._active: Callable[[], Gaussians] | None = None
+
+    def set_active(self, block: int | None, gaussians: Callable[[], Gaussians], sh_degree: int = 0) -> None:  # noqa: ARG002
+        self._active = gaussians
+
+    def state(self, name: BlockName) -> BlockState:  # noqa: ARG002
+        return self._state
+
+    def pending_for(self, block: int) -> BlockState | None:  # noqa: ARG002 - it has had them
+        return None
+
+    def rows(self, name: BlockName) -> int:
+        return len(self.state(name))
+
+    def stored_with_pending(self, block: int) -> Gaussians:
+        return self.state(block).gaussians
+
+    def gaussians(self, block: int) -> Gaussians:
+        if block != self._block:
+            return self._drawn[block]()
+        return self._state.gaussians if self._active is None else self._active().detach()
+
+    def as_drawn(self) -> Gaussians:
+        """The assigned block as others draw it: without Gaussians that join in this visit."""
+        return self._drawn[self._block]()
+
+    def count(self, block: int) -> int:
+        is_active = block == self._block and self._active is not None
+        return len(self._active()) if is_active else self._task.counts[block]
+
+    def bounds(self, block: int) -> Box | None:
+        return self._task.bounds[block]
 
 
 class OnAssignment(Visits):
@@ -87,7 +132,7 @@ class VisitWorker:
         self,
         task: VisitTask,
         state: BlockState,
-        drawn: Mapping[int, Callable[[], Gaussians]],
+        drawn: Drawn,
         listen: Callable[[Event], None] = lambda _: None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> VisitOutcome:
@@ -98,7 +143,7 @@ class VisitWorker:
             drawn: by block, what reads it as others draw it; only what some picture shows is read.
             clock: of training time.
         """
-        scene = AssignedScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
+        scene = AssignedScene(task, state, drawn)
         run = self._run_of(task, scene)
         run.announce.subscribe(listen)
         run.announce.subscribe(self._read_ahead)
