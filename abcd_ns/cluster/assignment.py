@@ -19,8 +19,7 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 
-Drawn = Mapping[int, Callable[[], Gaussians]]
-"""By block, what reads its Gaussians as others draw them."""
+Drawn = Mapping[int, Callable[[], Gaussians]]  # by block, what reads its Gaussians as others draw them
 
 
 class WorkersError(UserError):
@@ -135,14 +134,11 @@ class Member:
 
     number: int
     assignment: Assignment | None = None
-    done: int = 0
-    """Steps of its visit so far."""
+    done: int = 0  # steps of its visit so far
     ready: bool = True
-    since: float | None = None
-    """When it was first ready."""
+    since: float | None = None  # when it was first ready
     free_since: float = 0.0
-    waited: float = 0.0
-    """Seconds without a block until its last visit began."""
+    waited: float = 0.0  # seconds without a block until its last visit began
     pid: int = 0
     visits: int = 0
     deaths: int = 0

@@ -40,12 +40,9 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.step.batch import Rendered, Sample, Target
 from abcd_ns.engine.types import Gaussians
 
-SLACK = 2
-"""Visits begun and not yet taken in, for each worker: with 1 all would wait for the slowest."""
-SECONDS = 0.5
-"""Between two looks at the workers."""
-LOSSES = 5
-"""Workers that a visit may lose before the run gives up: it is the visit that ends them."""
+SLACK = 2  # visits begun and not yet taken in, for each worker: with 1 all would wait for the slowest
+SECONDS = 0.5  # between two looks at the workers
+LOSSES = 5  # workers that a visit may lose before the run gives up: it is the visit that ends them
 
 
 @dataclass
@@ -54,10 +51,8 @@ class InFlight:
 
     active: ActiveVisit
     assignment: Assignment
-    taken: int
-    """Gaussians that waited for the block and are in its visit."""
-    ends: int
-    """Views that each place for a visit has been given to draw when this one is to end."""
+    taken: int  # Gaussians that waited for the block and are in its visit
+    ends: int  # views that each place for a visit has been given to draw when this one is to end
     submitted: bool = False
     losses: int = 0
     outcome: VisitOutcome | None = None

@@ -40,10 +40,8 @@ from abcd_ns.errors import UserError, is_out_of_memory
 
 SILENCE = 600.0
 """Seconds without a word after which a worker counts as lost: a view of large blocks may take many."""
-FIRST_WORD = 5.0
-"""Seconds in which a process that was just forked says that it lives."""
-TELL_EVERY = 0.5
-"""Seconds between two words of a worker's progress."""
+FIRST_WORD = 5.0  # seconds in which a process that was just forked says that it lives
+TELL_EVERY = 0.5  # seconds between two words of a worker's progress
 PR_SET_PDEATHSIG = 1
 """Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
 
@@ -73,10 +71,8 @@ class Place(Member):
     """For a visit; its process, while there is one."""
 
     pipe: Connection | None = None
-    heard: float = 0.0
-    """When it last said something, or was started."""
-    lives: bool = False
-    """Whether it has said anything: from then on it ends when this process does."""
+    heard: float = 0.0  # when it last said something, or was started
+    lives: bool = False  # whether it has said anything: from then on it ends when this process does
 
 
 class ForkedWorkers(Workers):

@@ -41,8 +41,7 @@ from abcd_ns.machine import own_commit
 
 SILENCE, SLOW_START = 60.0, 600.0
 """Seconds after which a worker that does not answer, or does not begin, counts as lost."""
-LOOK_EVERY = 1.0
-"""Seconds between two questions."""
+LOOK_EVERY = 1.0  # seconds between two questions
 STARTS = 3
 """Workers in a row that may end before they are ready; then there is something wrong with all of them."""
 FULL = (of_ray.ObjectStoreFullError, of_ray.OutOfDiskError)
@@ -109,11 +108,9 @@ class Remote(Member):
     """A worker on some machine."""
 
     actor: Any = None
-    asked: ray.ObjectRef | None = None
-    """What it is at: getting ready, or a visit."""
+    asked: ray.ObjectRef | None = None  # what it is at: getting ready, or a visit
     question: ray.ObjectRef | None = None
-    asked_at: float = 0.0
-    """When its last question was put, or it was started."""
+    asked_at: float = 0.0  # when its last question was put, or it was started
 
 
 class RayWorkers(Workers):

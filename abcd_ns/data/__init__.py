@@ -5,7 +5,5 @@ Whatever reads or checks something raises InputError, which names the file or va
 at many files lists all that are bad.
 """
 
-OPTION = "--pipeline.datamanager.dataparser."
-"""Begins the options of the reader of data."""
-DOWNSCALE = f"{OPTION}downscale-factor"
-"""The option by which photos are reduced."""
+OPTION = "--pipeline.datamanager.dataparser."  # begins the options of the reader of data
+DOWNSCALE = f"{OPTION}downscale-factor"  # the option by which photos are reduced

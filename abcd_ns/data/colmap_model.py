@@ -21,8 +21,7 @@ from abcd_ns.data.split_lists import read_list_files
 
 MODEL_FOLDERS = ("sparse/*", "colmap/sparse/*", "sparse", "colmap/sparse", "colmap")
 """Where models may lie under the data folder, if not in it."""
-IMAGES = Path("images")
-"""Where its photos lie, if nothing else is said."""
+IMAGES = Path("images")  # where its photos lie, if nothing else is said
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """COLMAP's guess of down (+y) becomes nerfstudio's down (-z). A permutation: it rounds nothing."""
@@ -41,10 +40,8 @@ _MODELS = {
 """COLMAP's model id: name and number of parameters, for the models that OpenCV can undistort."""
 
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
-_PART = 1 << 16
-"""Points gathered at a time."""
-_MAX_NAME = 1 << 16
-"""Bytes within which a name must end."""
+_PART = 1 << 16  # points gathered at a time
+_MAX_NAME = 1 << 16  # bytes within which a name must end
 
 
 def find_models(data: Path) -> list[Path]:

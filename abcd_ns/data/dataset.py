@@ -22,8 +22,7 @@ from abcd_ns.data.picture_files import FileFinder, check_complete, read_size
 from abcd_ns.data.scene import Lens, distorted_lens
 from abcd_ns.data.undistort import undistortion
 
-PHOTOS = "photos"
-"""The entry of the metadata that holds one PhotoSource for each camera."""
+PHOTOS = "photos"  # the entry of the metadata that holds one PhotoSource for each camera
 _BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 

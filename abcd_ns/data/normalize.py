@@ -11,8 +11,7 @@ from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError
 
 Orientation = Literal["pca", "up", "vertical", "none"]
-_LEAST_UP = 0.1
-"""Length of the mean of unit vectors below which they are taken to cancel."""
+_LEAST_UP = 0.1  # length of the mean of unit vectors below which they are taken to cancel
 Center = Literal["poses", "focus", "none"]
 
 

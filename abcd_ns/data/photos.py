@@ -23,14 +23,12 @@ from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.picture_files import has_alpha, open_picture, undecodable
 from abcd_ns.data.undistort import Undistortion
 
-READERS = 4
-"""Threads that decode what is expected."""
+READERS = 4  # threads that decode what is expected
 FEWEST_AHEAD = 12
 """Photos that are read ahead of requests, beyond the budget: a step's, and those of the next."""
 _MASK_USED = 255
 _LOSSY = ("JPEG", "MPO", "WEBP")
-_Key = tuple[Literal["image", "mask"], int]
-"""What is read, and of which source."""
+_Key = tuple[Literal["image", "mask"], int]  # what is read, and of which source
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 UNREAD = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"})
 """Pictures that cameras and phones write, and nothing here reads."""
 
-_HIDDEN = (".", "@eaDir", "__MACOSX")
-"""How names begin that no program lists as a photo."""
+_HIDDEN = (".", "@eaDir", "__MACOSX")  # how names begin that no program lists as a photo
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read, by content and not by name. Pillow knows more, some of which it gives to other programs."""
 Image.MAX_IMAGE_PIXELS = 500_000_000  # Pillow's own limit is 89 million: aerial cameras have up to 450

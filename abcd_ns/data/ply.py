@@ -19,8 +19,7 @@ _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 
 _TYPES = dict(zip(_NAMES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
-GREY = 127
-"""Colour of points that come without one."""
+GREY = 127  # colour of points that come without one
 _COLORS = tuple(
     (f"{prefix}{red}", f"{prefix}{green}", f"{prefix}{blue}")
     for red, green, blue in (("red", "green", "blue"), ("r", "g", "b"))
@@ -31,12 +30,9 @@ _HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 """What files of Gaussians have in their place: colour = 0.5 + Y00 x coefficient (Kerbl et al., 2023)."""
 _MOST = 20.0
 """Of an opacity's logit, and of minus a scale's logarithm, which files may hold as infinite."""
-_RESTS = (0, 9, 24, 45)
-"""Harmonics of a Gaussian above degree 0, three channels, for degrees 0 to 3."""
-_WHITES = (255, 65_535, 4_294_967_295)
-"""What the brightest colour may be."""
-_OVERSHOOT = 2
-"""Times white: real numbers above it are still counted from that white, and clipped."""
+_RESTS = (0, 9, 24, 45)  # harmonics of a Gaussian above degree 0, three channels, for degrees 0 to 3
+_WHITES = (255, 65_535, 4_294_967_295)  # what the brightest colour may be
+_OVERSHOOT = 2  # times white: real numbers above it are still counted from that white, and clipped
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

@@ -11,10 +11,8 @@ import numpy as np
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.split_lists import SplitLists
 
-MAX_SIDE = 100_000
-"""Pixels along one side beyond which a width or height is taken for a broken file."""
-MAX_COORDINATE = 1e12
-"""World units beyond which a camera's place is taken for a broken file."""
+MAX_SIDE = 100_000  # pixels along one side beyond which a width or height is taken for a broken file
+MAX_COORDINATE = 1e12  # world units beyond which a camera's place is taken for a broken file
 
 
 @dataclass(frozen=True)

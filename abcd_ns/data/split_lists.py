@@ -12,8 +12,7 @@ from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError, Problems
 
 SPLITS = ("train", "val", "test")
-_NAMED = 3
-"""Unknown photos that a message names; the others are counted."""
+_NAMED = 3  # unknown photos that a message names; the others are counted
 
 
 @dataclass(frozen=True)

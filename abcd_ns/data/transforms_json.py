@@ -16,8 +16,7 @@ from abcd_ns.data.ply import read_points
 from abcd_ns.data.scene import Frame, Lens, Scene, distorted_lens, rigid
 from abcd_ns.data.split_lists import SPLITS, SplitLists, split_lists
 
-TRANSFORMS = "transforms"
-"""What the file is called, before its ending or the name of a split."""
+TRANSFORMS = "transforms"  # what the file is called, before its ending or the name of a split
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 LARGEST = sys.float_info.max

@@ -11,8 +11,7 @@ from abcd_ns.data.scene import Lens
 
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """OpenCV puts pixel centres at whole numbers; Lens puts them at +0.5."""
-_MAX_ZOOM = 10.0
-"""How much the focal length may change; real lenses, fisheyes too, stay well below."""
+_MAX_ZOOM = 10.0  # how much the focal length may change; real lenses, fisheyes too, stay well below
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,8 @@ EXTENSION = "KHR_gaussian_splatting"
 Z_TO_Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 """From nerfstudio's frame, in which z is up, to glTF's, in which y is."""
 _FLOAT, _BYTE = 5126, 5121
-_LARGEST = 2**32
-"""Bytes: the file tells its length in 32 bits."""
-_SPARE = 256
-"""Bytes kept free in the JSON for the corners of the box, which are known last."""
+_LARGEST = 2**32  # bytes: the file tells its length in 32 bits
+_SPARE = 256  # bytes kept free in the JSON for the corners of the box, which are known last
 
 
 class Attribute(NamedTuple):

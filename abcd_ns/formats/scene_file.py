@@ -15,8 +15,7 @@ from abcd_ns.formats.packed import BYTES_AT_ONCE, check_installed, packed
 from abcd_ns.formats.ply import columns, header, write_ply
 
 PACKED = (".compressed.ply", ".spz", ".sog")
-SUFFIXES = (*PACKED, ".ply", ".glb")
-"""The longer of two that fit comes first."""
+SUFFIXES = (*PACKED, ".ply", ".glb")  # the longer of two that fit comes first
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 """What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
 

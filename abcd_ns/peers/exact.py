@@ -52,10 +52,8 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
 class Gradients:
     """What a step adds up over cells, in RAM, for all n Gaussians of the scene."""
 
-    params: dict[str, Tensor]
-    """By parameter, of its shape."""
-    sums: Float[Tensor, "v n 10"]
-    """By view, see ResidualSums; density control judges by it."""
+    params: dict[str, Tensor]  # by parameter, of its shape
+    sums: Float[Tensor, "v n 10"]  # by view, see ResidualSums; density control judges by it
 
 
 class ExactTrainer(Trainer):

@@ -22,8 +22,7 @@ from abcd_ns.engine.types import Gaussians
 
 REVEALED_OPACITY = 0.02
 """Of deferred Gaussians, once they are seen: enough to learn, too little to spoil what is there."""
-REVEALED_SCALE = 0.5
-"""Their size, as a share of the distance to their neighbours."""
+REVEALED_SCALE = 0.5  # their size, as a share of the distance to their neighbours
 
 
 def defer(points: BlockState) -> BlockState:

@@ -25,8 +25,7 @@ from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
 
-Content = tuple[dict[str, Tensor], dict[str, Any]]
-"""Of a block: tensors and JSON."""
+Content = tuple[dict[str, Tensor], dict[str, Any]]  # of a block: tensors and JSON
 
 
 class ParameterStore:

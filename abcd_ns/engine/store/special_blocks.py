@@ -5,13 +5,10 @@ In a store a shard is found under each name, as under a block's number.
 
 from collections.abc import Iterable
 
-BlockName = int | str
-"""A block's number, or one of these names."""
+BlockName = int | str  # a block's number, or one of these names
 
-WHOLE = "whole"
-"""All blocks at once, where a visit names its block; nothing is stored under it."""
-DEFERRED = "deferred"
-"""Deferred points: Gaussians that join at the end of the warm-up."""
+WHOLE = "whole"  # all blocks at once, where a visit names its block; nothing is stored under it
+DEFERRED = "deferred"  # deferred points: Gaussians that join at the end of the warm-up
 ACTIVE = "live"  # its name in stores
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
