@@ -19,34 +19,33 @@ from abcd_ns.data.picture_files import (
 from abcd_ns.data.scene import Frame, Scene
 
 
-def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[str]]:
-    """Find and check the photos of all frames.
+def locate_photos(scene: Scene, factor: int) -> list[PhotoSource]:
+    """Find and check the photos of all frames; one source for each, without undistortion and mask.
 
     images_N (N = `factor`) is used where every photo is there in W/N x H/N, rounded either way. Otherwise
     the full photos are reduced to floor(W/N) x floor(H/N). Where there are no full photos, the least
-    reduced copies that can serve are taken. Gives one source per frame, without undistortion and mask, and
-    notes for the user.
+    reduced copies that can serve are taken.
     """
-    full = scene.photo_folder
-    copies = _reduced_folders(scene)
-    notes = []
+    full, copies = scene.photo_folder, _reduced_folders(scene)
     if factor in copies:
         try:
-            return _check_folder(copies[factor], factor, scene.frames, factor), notes
+            return _check_folder(copies[factor], factor, scene.frames, factor)
         except InputError as error:
             if not full.is_dir():
                 raise
-            notes.append(f"{copies[factor]} does not fit: {full} is reduced instead ({error.lines[0]})")
+            fault = error.lines[0]
+            scene.notes.append(f"{copies[factor]} does not fit: {full} is reduced instead ({fault})")
     if full.is_dir():
-        return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
+        _note_unposed(scene)
+        return _check_folder(full, 1, scene.frames, factor)
     if not copies:
         count, example = len(scene.frames), next((frame.name for frame in scene.frames), "none")
         raise InputError(f"{full} is missing: put the {count} photos there ({example}, ...){_hint(scene)}.")
     of = max((n for n in copies if factor % n == 0), default=min(copies))
     if factor % of:
         found = of * max(factor // of, 1)
-        notes.append(f"{full} does not exist: {copies[of]} is used, at 1/{found} and not 1/{factor}.")
-    return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
+        scene.notes.append(f"{full} does not exist: {copies[of]} is used, at 1/{found} and not 1/{factor}.")
+    return _check_folder(copies[of], of, scene.frames, max(factor, of))
 
 
 def _hint(scene: Scene) -> str:
@@ -80,11 +79,11 @@ def as_stored(scene: Scene) -> Scene:
         if any(abs(have * of_width - want * width) >= of_width for have, want in zip(*pair, strict=True)):
             return scene
     frames = [replace(f, lens=f.lens.resized(*size)) for f, size in zip(scene.frames, sizes, strict=True)]
-    note = (
+    scene.notes.append(
         f"The photos in {scene.photo_folder} are {width / of_width:.3g} times as large as their cameras, as "
         f"{width} x {height} px and {of_width} x {of_height}: cameras are scaled to them."
     )
-    return replace(scene, frames=frames, notes=[*scene.notes, note])
+    return replace(scene, frames=frames)
 
 
 def assume_photos(scene: Scene, factor: int) -> list[PhotoSource]:
@@ -149,13 +148,14 @@ def _check_size(path: Path, size: tuple[int, int], frame: Frame, of: int) -> Non
     )
 
 
-def _unposed(folder: Path, scene: Scene) -> list[str]:
-    """A note on photos that the model knows nothing of: training goes on without them."""
+def _note_unposed(scene: Scene) -> None:
+    """Note photos that the model knows nothing of: training goes on without them."""
+    folder = scene.photo_folder
     posed = {os.path.abspath(folder / frame.name) for frame in scene.frames}
     known = posed | {os.path.abspath(frame.mask_path) for frame in scene.frames if frame.mask_path}
     found = (path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
     extra = sorted(str(p.relative_to(folder)) for p in found if os.path.abspath(p) not in known)
-    if not extra:
-        return []
     few = " Fewer than half have one: see whether the model is complete." if len(extra) > len(posed) else ""
-    return [f"{len(extra)} photos in {folder} have no pose and are not used ({extra[0]}, ...).{few}"]
+    if extra:
+        unused = f"{len(extra)} photos in {folder} have no pose and are not used ({extra[0]}, ...)"
+        scene.notes.append(f"{unused}.{few}")

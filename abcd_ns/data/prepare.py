@@ -161,7 +161,7 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
         with problems.collect():
             check_layout(scene)
         with problems.collect():
-            files, notes = _find_photos(scene, factor, needs_photos)
+            files = _find_photos(scene, factor, needs_photos)
     except OSError as error:
         where = error.filename or options.data
         raise InputError(f"{where} cannot be read ({error.strerror}); check its permissions.") from None
@@ -170,17 +170,16 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
     placed = (options.orientation_method, options.center_method, options.auto_scale_poses)
     similarity = normalizing_similarity(poses, *placed, options.scale_factor)
-    points, in_model, more = _points(scene, similarity)
-    lists = scene.split_lists
+    points, in_model = _points(scene, similarity)
+    notes, lists = scene.notes, scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
-        more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
+        notes.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
     masked = sum(source.mask_path is not None for source in sources)
     if 0 < masked < len(sources):
-        more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
+        notes.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
     chosen = wanted is None and not options.max_side and factor > 1
     reduced = (_reduction(scene, sources, factor),) if chosen and needs_photos else ()
-    notes = (*scene.notes, *notes, *more)
-    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, reduced)
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, tuple(notes), reduced)
 
 
 def automatic_factor(scene: Scene, max_side: int = 0) -> int:
@@ -221,8 +220,7 @@ def check_masks(sources: list[PhotoSource]) -> None:
     problems.raise_if_any()
 
 
-def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSource], list[str]]:
-    """The photos' files, and notes."""
+def _find_photos(scene: Scene, factor: int, needed: bool) -> list[PhotoSource]:
     problems = Problems()
     for frame in scene.frames:
         if frame.mask_path is not None:
@@ -231,45 +229,42 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSou
     with problems.collect():
         found = locate_photos(scene, factor)
     if problems and not needed:
-        return assume_photos(scene, factor), [f"Going on without photos: {problems[0]}"]
+        scene.notes.append(f"Going on without photos: {problems[0]}")
+        return assume_photos(scene, factor)
     problems.raise_if_any()
     return found
 
 
 def _sources(scene: Scene, files: list[PhotoSource]) -> tuple[list[PhotoSource], list[Lens]]:
     """Photo sources and final cameras. A lens without distortion is left alone, pixel for pixel."""
-    flats, problems = {}, Problems()
-    lenses = [frame.lens.resized(*file.reduced) for frame, file in zip(scene.frames, files, strict=True)]
-    for frame, lens in zip(scene.frames, lenses, strict=True):
-        if lens not in flats:
-            flats[lens] = None
-            with problems.collect(f"{frame.name}: "):
-                flats[lens] = undistortion(lens) if lens.distorted else None
+    sources, lenses, problems = [], [], Problems()
+    for frame, file in zip(scene.frames, files, strict=True):
+        lens = frame.lens.resized(*file.reduced)
+        with problems.collect(f"{frame.name}: ", name=frame.name):
+            flat = undistortion(lens) if lens.distorted else None
+            sources.append(replace(file, undistortion=flat, mask_path=frame.mask_path))
+            lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()
-    sources = [
-        replace(file, undistortion=flats[lens], mask_path=frame.mask_path)
-        for frame, file, lens in zip(scene.frames, files, lenses, strict=True)
-    ]
-    return sources, [flats[lens].pinhole if flats[lens] else lens for lens in lenses]
+    return sources, lenses
 
 
-def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np.ndarray, list[str]]:
-    """(metadata as splatfacto expects it, the points in the scene's world, notes)."""
+def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np.ndarray]:
+    """Metadata as splatfacto expects it, and the points in the scene's world."""
     with np.errstate(over="ignore", invalid="ignore"):
         xyz = similarity.points(scene.points_xyz).astype(np.float32)
-    good = np.isfinite(xyz).all(axis=1)
-    left_out = f"{scene.model}: {(~good).sum()} points with NaN, infinity or absurd numbers are left out."
-    notes = [] if good.all() else [left_out]
+    good, model, notes = np.isfinite(xyz).all(axis=1), scene.model, scene.notes
+    if not good.all():
+        notes.append(f"{model}: {(~good).sum()} points with NaN, infinity or absurd numbers are left out.")
     if not good.any():
         notes.append(
-            f"{scene.model} has no points: Gaussians start at random places, which costs quality; make some "
+            f"{model} has no points: Gaussians start at random places, which costs quality; make some "
             "with `point_triangulator` of the program colmap, or the whole model by `abcd poses`."
         )
-        return {}, np.empty((0, 3)), notes
+        return {}, np.empty((0, 3))
     rgb = scene.points_rgb
     if rgb is None:
-        notes.append(f"{scene.model}: the points have no colours: Gaussians start grey.")
+        notes.append(f"{model}: the points have no colours: Gaussians start grey.")
         rgb = np.full(xyz.shape, GREY, np.uint8)
     rgb = np.ascontiguousarray(rgb[good])
     metadata = {"points3D_xyz": torch.from_numpy(xyz[good]), "points3D_rgb": torch.from_numpy(rgb)}
-    return metadata, scene.points_xyz[good], notes
+    return metadata, scene.points_xyz[good]

@@ -112,7 +112,6 @@ def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folde
 
 
 def _number(values: dict[str, Any], key: str, label: object, default: float | None = None) -> float:
-    """values[key] as a finite float."""
     value = values.get(key, default)
     # Compared rather than converted: JSON's whole numbers may be larger than any float.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
@@ -191,7 +190,6 @@ def _focal(values: dict[str, Any], axis: str, size: int, label: str) -> float | 
 
 
 def _coefficients(values: dict[str, Any], label: str) -> list[float]:
-    """Of the distortion, in the order of _COEFFICIENTS."""
     if "distortion_params" not in values:
         return [_number(values, key, label, default=0.0) for key in _COEFFICIENTS]
     row = _matrix(values["distortion_params"], label).ravel()
