@@ -54,8 +54,7 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
 
 
 def keep_to_ourselves(starts: bool) -> None:
-    """Set what Ray reads from the environment, some of it when it is imported. If a cluster `starts` here,
-    WorkersError says that Ray was imported before."""
+    """Set what Ray reads from the environment; before it is imported, if a cluster `starts` here."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without num_gpus, leave GPUs visible
     if not starts:

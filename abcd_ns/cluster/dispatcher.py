@@ -87,8 +87,7 @@ class Dispatcher(Coordinator):
         return state.active is None and not warms_up
 
     def await_step(self) -> None:
-        """As the trainer's. NothingSeenError says that no view sees any block, WorkersError that there are no
-        workers, or that a visit lost LOSSES of them."""
+        """As the trainer's. WorkersError says that a visit lost LOSSES of them, or that there are none."""
         if not self._shown and self.device.type == "cuda":
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:

@@ -114,8 +114,7 @@ class OnAssignment(Visits):
 
 
 class VisitWorker:
-    """Trains visits, one after the other, on what `target` gives for a sample; `read_ahead` hears of events,
-    for photos that are wanted soon."""
+    """Trains visits on what `target` gives for a sample; `read_ahead` hears of photos wanted soon."""
 
     def __init__(
         self,

@@ -28,8 +28,7 @@ _BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 class AbcdDataset(InputDataset):
     """The photos that a dataparser, ours or any of nerfstudio's, found: at the size of their cameras and
-    without distortion. See `Photos` and `with_photos`; splatfacto's datamanager passes a `scale_factor` of
-    1."""
+    without distortion. See `Photos` and `with_photos`; `scale_factor` is 1."""
 
     def __init__(
         self,

@@ -43,8 +43,7 @@ def exit_on_user_error() -> Iterator[None]:
 
 class InputError(UserError):
     """The input cannot be used; a command shows `str(error)` alone and exits with code 2. Each line is a
-    sentence that names the file or value and the fix; `str(error)` has the first SHOWN and counts the
-    rest."""
+    sentence that names the file or value and the fix; of more than SHOWN, `str(error)` counts the rest."""
 
     def __init__(self, *lines: str):
         self.lines = tuple(one_line(line) for line in lines)
@@ -62,8 +61,7 @@ class Problems(list[str]):
 
     @contextmanager
     def collect(self, label: str = "", name: str = "") -> Iterator[None]:
-        """Note the InputError that the body raises, if any, each line after the label, and continue. Lines
-        that are equal but for `name` become one if they are many."""
+        """Note the body's InputError, if any. Many lines that are equal but for `name` become one."""
         try:
             yield
         except InputError as error:

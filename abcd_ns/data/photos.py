@@ -86,8 +86,7 @@ class Photos:
         return self._kept.currsize
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
-        """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it. The file may
-        have changed since it was checked."""
+        """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it."""
         return self._get(("image", index))
 
     def expect(self, indices: Iterable[int]) -> None:
@@ -132,8 +131,8 @@ class Photos:
 
 
 def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[np.ndarray, "y x c"]:
-    """The mean of the source's area that each pixel of the result covers, of the same type. `size` is (width,
-    height), at most the source's; the ratio need not be whole."""
+    """The mean of the source's area that each pixel covers; `size` is (width, height), at most the
+    source's."""
     if size == (image.shape[1], image.shape[0]):
         return image
     reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -29,8 +29,7 @@ _PNG_BIT_DEPTH_BYTE = 24
 
 
 def check_regular(path: Path, kind: str = "photo") -> None:
-    """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes; `kind` is
-    what the message calls it."""
+    """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes."""
     try:
         status = path.stat()
     except OSError as error:

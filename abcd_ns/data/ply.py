@@ -37,8 +37,7 @@ _OVERSHOOT = 2  # times white: real numbers above it are still counted from that
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """The vertices of a .ply file, ascii or binary: (xyz float64 [n, 3], rgb uint8 [n, 3], or None in a file
-    without colours). White is what the type and the largest value say: 1 in real numbers, 255, 65535 or
-    2^32 - 1."""
+    without colours). White is what the type and the largest value say: 1, 255, 65535 or 2^32 - 1."""
     if not path.is_file():
         raise InputError(f"{path} does not exist; correct ply_file_path, or remove it to start at random.")
     fix = "write the points again, or remove the file and any ply_file_path to start at random"
@@ -48,8 +47,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def some_means(path: Path, most: int) -> tuple[int, Float64[Tensor, "n 3"]]:
-    """How many Gaussians a .ply file has, and the means of up to so many, evenly spaced and finite; raises as
-    `read_gaussians`."""
+    """As `read_gaussians`: how many there are, and the finite means of up to so many, evenly spaced."""
     rows, groups = _rows(path)
     some = _columns(rows[:: -(-len(rows) // most)], groups["means"]).double()
     return len(rows), some[some.isfinite().all(dim=1)]
@@ -63,7 +61,7 @@ def is_antialiased(path: Path) -> bool:
 
 def read_gaussians(path: Path) -> tuple[Gaussians, int]:
     """The Gaussians of a .ply file as 3DGS, `abcd export` and other trainers write it; and how many rows are
-    left out, since they hold NaN, or no rotation. InputError says that it lacks a property, or is damaged."""
+    left out, since they hold NaN, or no rotation. InputError says what the file lacks."""
     rows, groups = _rows(path)
     found = {name: _columns(rows, group) for name, group in groups.items()}
     found["opacities"].clamp_(-_MOST, _MOST)

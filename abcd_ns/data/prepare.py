@@ -183,9 +183,8 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
 
 
 def automatic_factor(scene: Scene, max_side: int = 0) -> int:
-    """What photos are divided by where nothing is said: the smallest power of two that leaves no side longer
-    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first. With
-    `max_side` the smallest whole number that leaves none longer than that."""
+    """The smallest power of two that leaves no side longer than MAX_AUTO_SIDE, as nerfstudio's parsers have
+    it, but by the largest photo. With `max_side` the smallest whole number that leaves none longer."""
     longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
     if max_side:
         return max(-(-longest // max_side), 1)

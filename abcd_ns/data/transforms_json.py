@@ -35,7 +35,7 @@ _UNREAD = (
 
 
 def read_transforms(path: Path) -> Scene:
-    """The scene of a transforms.json file, in its world; all paths in it are relative to its folder and stay
+    """The scene of a transforms.json file, in its world. Paths in it are relative to its folder, and
     inside."""
     meta = _load(path)
     root, problems, frames = path.parent, Problems(), []
@@ -199,8 +199,7 @@ def _coefficients(values: dict[str, Any], label: str) -> list[float]:
 
 
 def _photo_folder(root: Path, frames: list[Frame]) -> tuple[Path, list[Frame]]:
-    """The folder that all photos share, if it is one below the root, and frames named relative to it. Reduced
-    copies lie beside that folder: images and images_4."""
+    """The one folder below the root that all photos share, if any, and frames named relative to it."""
     tops = {frame.name.partition(os.sep)[0] for frame in frames}
     if len(tops) > 1 or any(os.sep not in frame.name for frame in frames):
         return root, frames

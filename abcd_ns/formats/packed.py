@@ -27,8 +27,7 @@ def check_installed() -> None:
 def packed(
     count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians], antialiased: bool = False
 ) -> bytes:
-    """A file of `count` Gaussians; `kind` is "spz", "sog" or "compressed.ply". UserError says that it
-    cannot be written."""
+    """A file of `count` Gaussians; `kind` is "spz", "sog" or "compressed.ply". Raises UserError."""
     import gaussforge
 
     table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0

@@ -29,8 +29,7 @@ def shows(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, "n"]:
 
 
 def suffix_of(path: Path, missing: str | None = None) -> str:
-    """Which of SUFFIXES the path has, or else `missing`. UserError says that there is none, or that the
-    package that writes it is not there."""
+    """Which of SUFFIXES the path has, or else `missing`; UserError where nothing writes such files."""
     found = next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), missing)
     if found is None:
         raise UserError(f"--out {path} must end in one of {', '.join(sorted(SUFFIXES))}.")
@@ -40,8 +39,7 @@ def suffix_of(path: Path, missing: str | None = None) -> str:
 
 
 def rounding(suffix: str, largest: float) -> float:
-    """By how much positions may be off whose largest coordinate is this; UserError where the format cannot
-    hold it."""
+    """By how much positions up to `largest` may be off; UserError where the format cannot hold them."""
     if suffix != ".spz":
         return largest * torch.finfo(torch.float32).eps
     if largest >= SPZ_REACH:

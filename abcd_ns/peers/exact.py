@@ -58,8 +58,7 @@ class Gradients:
 
 class ExactTrainer(Trainer):
     """Every step trains all blocks: `render` gives pictures whose gradient the caller's backward takes, and
-    `after_step` passes it to blocks. Between steps the run's parameters are empty, so that the caller's
-    optimizers have nothing to step."""
+    `after_step` passes it to blocks. Between steps the run's parameters are empty."""
 
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)

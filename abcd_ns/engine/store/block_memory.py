@@ -7,8 +7,7 @@ from abcd_ns.engine.store.special_blocks import BlockName
 
 
 class BlockMemory:
-    """Blocks by name, as they are kept, under a limit of bytes: least recently used out first, Gaussians last
-    of all."""
+    """Blocks by name under a limit of bytes: least recently used out first, what is drawn last of all."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -43,8 +42,7 @@ class BlockMemory:
             kept.pop(name, None)
 
     def shrink(self, spare: int = 0) -> None:
-        """Let go of what goes beyond the limit, less `spare` bytes; the Gaussians used last stay in any
-        case."""
+        """Let go of what exceeds the limit, less `spare` bytes; the Gaussians used last stay in any case."""
         beyond = self.nbytes + spare - self.limit
         while beyond > 0 and (self._training or len(self._drawn) > 1):
             _, gone = (self._training or self._drawn).popitem(last=False)

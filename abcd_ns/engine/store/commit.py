@@ -63,8 +63,7 @@ def commit(
 def pending_without(
     scene: StoredScene, blocks: set[int], arrivals: BlockState | None = None
 ) -> dict[BlockName, BlockState]:
-    """The pending migrants, under their name, without those of these blocks and with arrivals; nothing where
-    that leaves them as they were."""
+    """The pending migrants without those of these blocks and with arrivals, if that changes them."""
     parts = [arrivals] if arrivals else []
     if not parts and all(scene.pending_for(block) is None for block in blocks):
         return {}

@@ -35,8 +35,7 @@ class ChangedScene(_Derived):
 
 
 class HeldScene(_Derived):
-    """A scene's blocks on a device, whole: read once, as far as there is room, bytes, while none of them
-    changes."""
+    """A scene's blocks on a device while none changes: read once, as far as there is room, bytes."""
 
     def __init__(self, scene: BlockScene, device: torch.device, room: int) -> None:
         super().__init__(scene)

@@ -54,8 +54,7 @@ class Manifest:
 
     @staticmethod
     def from_bytes(data: bytes, path: Path) -> "Manifest":
-        """The manifest in `data`, which was read from `path`; StoreError where its format or version is
-        another, or a single byte was altered."""
+        """The manifest in the file `path`; StoreError for another version, or a single altered byte."""
         try:
             envelope = json.loads(data)
         except ValueError as error:
@@ -77,8 +76,7 @@ class Manifest:
 
 
 def manifest_path(folder: Path, name: str | None = None) -> Path:
-    """Where the present manifest lies, or the one pinned under `name`, which ValueError refuses where it has
-    other characters than letters, digits, '_', '-' and '.'."""
+    """Where the present manifest lies, or the one pinned under `name`, which may not leave the folder."""
     if name is None:
         return folder / "manifest.json"
     if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", name):

@@ -66,8 +66,7 @@ class ParameterStore:
     def open(
         cls, folder: Path | str, name: str | None = None, *, read_only: bool = False
     ) -> "ParameterStore":
-        """The store in `folder`: its present generation, for writing unless `read_only`; with `name` the one
-        pinned under that, for reading alone."""
+        """The store in `folder`, for writing unless `read_only`; with `name`, what is pinned, for reading."""
         folder = Path(folder)
         if not folder.is_dir():
             raise StoreError(f"{folder} does not exist; give the folder of a store.")
@@ -133,12 +132,8 @@ class ParameterStore:
         return copy.deepcopy(self._shard(block).meta)
 
     def load(self, block: BlockName, names: Sequence[str] | None = None) -> Content:
-        """The tensors of a block, on the CPU and owning their memory, and its JSON.
-
-        Args:
-            names: of the tensors that are wanted; each file is checked once in the life of this object. None
-                for all, which are checked each time.
-        """
+        """The tensors of a block, on the CPU and owning their memory, and its JSON; KeyError for no block.
+        Some `names` are checked once in the life of this object, all of them (None) each time."""
         while True:
             shard = self._shard(block)
             path = self.folder / shard.file
@@ -192,8 +187,7 @@ class ParameterStore:
         return generation
 
     def pin(self, name: str) -> None:
-        """Keep the present generation under `name`, in place of what had this name, until `unpin`; ValueError
-        as `manifest_path`."""
+        """Keep the present generation under `name`, in place of what had this name, until `unpin`."""
         self._require_writable()
         path = manifest_path(self.folder, name)
         try:
@@ -228,8 +222,7 @@ class ParameterStore:
 
     def clone_to(self, folder: Path | str, name: str | None = None) -> None:
         """Make `folder` a store that holds this generation, or the one pinned under `name`. Shards are shared
-        by hard links where the file system can. They are never written in place, so neither store changes the
-        other."""
+        by hard links where the file system can; as they are never changed, neither store alters the other."""
         folder = Path(folder)
         manifest = self._manifest
         if name is not None:

@@ -37,16 +37,14 @@ def write_shard(
 
 
 def verify_shard(path: Path, shard: Shard) -> None:
-    """Compare every byte of the file with the manifest. StoreError says that it has changed, OSError that it
-    cannot be read."""
+    """Compare every byte of the file with the manifest. Raises StoreError where it differs, or OSError."""
     with open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size != shard.nbytes or _checksum(file) != shard.checksum:
             raise StoreError(f"{path} is damaged: its checksum is wrong. Go back to a pinned generation.")
 
 
 def read_shard(path: Path, names: Iterable[str] | None) -> dict[str, Tensor]:
-    """The tensors of these names, or all, on the CPU. OSError or SafetensorError says that the file cannot be
-    read, or has no such tensor."""
+    """The tensors of these names, or all, on the CPU. Raises OSError or SafetensorError."""
     with _opened(path) as file:
         wanted = sorted(file.keys()) if names is None else names
         # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
