@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.normalize import normalizing_similarity
@@ -200,13 +199,6 @@ def test_photos_that_are_all_one_share_of_their_cameras_are_taken(tmp_path, divi
         assert (cameras.width[row], cameras.height[row]) == (int(width / divide), int(height / divide))
         assert cameras.fx[row].item() == pytest.approx(width * 0.9 * int(width / divide) / width)
     assert "times as large as their cameras" in capsys.readouterr().out
-
-
-def test_photos_of_several_shares_are_refused(tmp_path):
-    write_model(tmp_path / "sparse/0")
-    write_photos(tmp_path / "images", divide=2)
-    Image.fromarray(np.zeros((41, 61, 3), np.uint8)).save(tmp_path / "images" / NAMES[0])
-    assert "its camera is 61 x 41" in refusal(tmp_path)
 
 
 # Surveys

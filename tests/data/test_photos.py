@@ -9,7 +9,6 @@ from threading import Barrier
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -20,6 +19,7 @@ from abcd_ns.data.scene import Lens
 from abcd_ns.data.undistort import distort, undistortion
 
 WIDTH, HEIGHT = 40, 24
+HALF = (WIDTH // 2, HEIGHT // 2)
 
 
 def noise(seed: int, channels: int = 3, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
@@ -161,9 +161,7 @@ def test_photo_that_changed_since_the_check_is_named(sources):
 
 def with_alpha(image: np.ndarray) -> np.ndarray:
     """Two thirds transparent, with soft edges, and magenta below."""
-    alpha = np.clip(np.random.default_rng(9).integers(-300, 320, (*image.shape[:2], 1)), 0, 255).astype(
-        np.uint8
-    )
+    alpha = np.random.default_rng(9).integers(-300, 320, (*image.shape[:2], 1)).clip(0, 255).astype(np.uint8)
     return np.concatenate([np.where(alpha == 0, [255, 0, 255], image).astype(np.uint8), alpha], axis=2)
 
 
@@ -174,13 +172,9 @@ def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp
     reduced = (240 // divide, 180 // divide)
     flat = None if lens is None else undistortion(lens_pair(lens, *reduced)[0])
     on_black = np.rint(image[..., :3] * (image[..., 3:] / 255.0)).astype(np.uint8)
-    cut, black = (
-        Photos([PhotoSource(saved(tmp_path / name, each), size, reduced, flat)])
-        .image(0)
-        .numpy()
-        .astype(float)
-        for name, each in (("cut.png", image), ("black.png", on_black))
-    )
+    paths = saved(tmp_path / "cut.png", image), saved(tmp_path / "black.png", on_black)
+    photos = Photos([PhotoSource(path, size, reduced, flat) for path in paths])
+    cut, black = (photos.image(row).numpy().astype(float) for row in range(2))
     error = cut[..., :3] * cut[..., 3:] / 255 - black
     assert np.abs(error).max() < (2 if lens is None else 3)  # OpenCV rounds weights of 8-bit pixels to 1/32
     assert 0.2 < (cut[..., 3] > 0).mean() <= 1
@@ -189,27 +183,29 @@ def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp
 # Masks
 
 
-def masked(tmp_path: Path, mask: np.ndarray, reduced: tuple[int, int]) -> Photos:
-    photo = saved(tmp_path / "photo.png", noise(0))
-    return Photos(
-        [PhotoSource(photo, (WIDTH, HEIGHT), reduced, mask_path=saved(tmp_path / "mask.png", mask))]
-    )
+def read_mask(folder: Path, name: str, reduced: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
+    """bool [height, width]."""
+    photo = saved(folder / "photo.png", noise(0))
+    source = PhotoSource(photo, (WIDTH, HEIGHT), reduced, mask_path=folder / name)
+    return Photos([source]).mask(0).numpy()[..., 0]
 
 
 def test_reduced_mask_keeps_pixels_that_count_as_a_whole(tmp_path):
     mask = np.where(np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.9, 255, 0).astype(np.uint8)
-    reduced = masked(tmp_path, mask, (WIDTH // 2, HEIGHT // 2)).mask(0)
+    saved(tmp_path / "mask.png", mask)
     expected = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).min(axis=(1, 3)) > 0
-    assert reduced.dtype == torch.bool
-    assert np.array_equal(reduced.numpy()[..., 0], expected)
+    reduced = read_mask(tmp_path, "mask.png", HALF)
+    assert reduced.dtype == bool
+    assert np.array_equal(reduced, expected)
     assert expected.any()
     assert not expected.all()
 
 
 def test_mask_may_have_the_reduced_size(tmp_path):
-    mask = np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
+    mask = np.full(HALF[::-1], 255, np.uint8)
     mask[3, 5] = 0
-    assert np.array_equal(masked(tmp_path, mask, (WIDTH // 2, HEIGHT // 2)).mask(0).numpy()[..., 0], mask > 0)
+    saved(tmp_path / "mask.png", mask)
+    assert np.array_equal(read_mask(tmp_path, "mask.png", HALF), mask > 0)
 
 
 HIDDEN = np.hypot(*np.ogrid[-11:13, -20:20]) < 8
@@ -269,13 +265,6 @@ def test_of_soft_edges_what_is_nearly_white_is_seen(tmp_path):
     step = np.clip(np.arange(WIDTH) * 20.0 - 200, 0, 255)
     Image.fromarray(np.tile(step, (HEIGHT, 1)).astype(np.uint8)).save(tmp_path / "mask.png")
     assert np.array_equal(read_mask(tmp_path, "mask.png")[0], step > 192)
-
-
-def read_mask(folder: Path, name: str) -> np.ndarray:
-    """bool [HEIGHT, WIDTH]."""
-    size = (WIDTH, HEIGHT)
-    photo = saved(folder / "photo.png", noise(0))
-    return Photos([PhotoSource(photo, size, size, mask_path=folder / name)]).mask(0).numpy()[..., 0]
 
 
 # Distortion

@@ -9,13 +9,7 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_blocks, independent_trainer
-from tests.reference.scenes import (
-    GROWING,
-    STILL,
-    assert_resumes,
-    equal,
-    listen,
-)
+from tests.reference.scenes import GROWING, STILL, assert_resumes, equal, listen
 
 
 @pytest.fixture

@@ -215,9 +215,6 @@ def test_a_picture_that_is_broken_off_leaves_no_lock_behind(scene):
     scene._writer.mutex.release()
 
 
-# RAM
-
-
 # The pending migrants
 
 
