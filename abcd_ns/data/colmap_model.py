@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.picture_files import FileFinder, check_regular
 from abcd_ns.data.ply import read_points
-from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, rigid
-from abcd_ns.data.split_lists import read_list_files
+from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, read_list_files, rigid
 
 MODEL_FOLDERS = ("sparse/*", "colmap/sparse/*", "sparse", "colmap/sparse", "colmap")
 """Where models may lie under the data folder, if not in it."""

@@ -13,8 +13,7 @@ import numpy as np
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.picture_files import FileFinder, read_size
 from abcd_ns.data.ply import read_points
-from abcd_ns.data.scene import Frame, Lens, Scene, distorted_lens, rigid
-from abcd_ns.data.split_lists import SPLITS, SplitLists, split_lists
+from abcd_ns.data.scene import SPLITS, Frame, Lens, Scene, SplitLists, distorted_lens, rigid, split_lists
 
 TRANSFORMS = "transforms"  # what the file is called, before its ending or the name of a split
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")

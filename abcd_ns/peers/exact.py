@@ -38,6 +38,7 @@ from abcd_ns.engine.train.schedule import endless_order, exponential_decay, view
 from abcd_ns.engine.train.step.batch import (
     COMING,
     Batch,
+    Pictures,
     Rendered,
     Sample,
     background,
@@ -106,12 +107,7 @@ class ExactTrainer(Trainer):
         self._pictures = [composite(whole, sample.background).requires_grad_() for whole, sample in pairs]
         return Rendered(tuple(picture.clamp(0, 1) for picture in self._pictures), tuple(wholes), ())
 
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
+    def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """Photometric, the mean of the samples'; what the density strategy asks for is added by block."""
         losses, pairs = batch.losses(pictures, photos, self.config), zip(pictures, photos, strict=True)
         self._residuals = [photo[..., :3] - picture.detach() for picture, photo in pairs]
