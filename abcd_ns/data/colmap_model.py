@@ -74,10 +74,9 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
     files, frames, called = FileFinder(photos, listed), [], {}
     hidden = None if masks is None else FileFinder(data / masks, data / masks)
     for name, quat, translation, camera in posed:
-        label = f"{listed}: {name}"
+        label, lacks = f"{listed}: {name}", f"which {cameras.name} does not have"
         with problems.collect(name=name):
             if camera not in lenses:
-                lacks = f"which {cameras.name} does not have"
                 raise InputError(f"{label} uses camera {camera}, {lacks}; make the model again.")
             called[name] = files.find(name).relative_to(os.path.abspath(photos)).as_posix()
             pose = _camera_to_world(quat, translation, label)
@@ -87,17 +86,8 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
         problems.append(f"{hidden.folder} {lacks} such as {frames[0].name}.png; put masks there.")
     problems.raise_if_any()
     frames.sort(key=lambda frame: frame.name)
-    return Scene(
-        model=model,
-        root=data,
-        photo_folder=photos,
-        frames=frames,
-        points_xyz=xyz @ Z_UP[:, :3].T,
-        points_rgb=rgb,
-        applied_transform=Z_UP,
-        split_lists=read_list_files(data, called),
-        notes=files.notes,
-    )
+    xyz, lists = xyz @ Z_UP[:, :3].T, read_list_files(data, called)
+    return Scene(model, data, photos, frames, xyz, rgb, Z_UP, split_lists=lists, notes=files.notes)
 
 
 def _part(model: Path, name: str) -> Path | None:
@@ -127,7 +117,6 @@ def _photo_folder(data: Path, images: Path, names: list[str]) -> Path:
 
 
 def _mask(files: FileFinder, name: str) -> Path | None:
-    """The mask of a photo."""
     for each in (str(Path(name).with_suffix(".png")), f"{name}.png"):
         if (path := files.find(each, moved=False)).exists():
             return path

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -157,7 +157,7 @@ def check_layout(scene: Scene) -> None:
 
 
 def split_lists(
-    found: Mapping[str, Sequence[str]], known: Mapping[str, str], labels: Mapping[str, str]
+    found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
 ) -> SplitLists | None:
     """The lists that there are as one split; None without any. What is held out is val and test together. If
     only one side is listed, the other is all the rest.
@@ -165,7 +165,7 @@ def split_lists(
     Args:
         found: by split, what its list names.
         known: the name of each frame, by what lists call it.
-        labels: by split, what messages call its list.
+        label: what messages call the list of a split.
     """
     if not found:
         return None
@@ -175,7 +175,7 @@ def split_lists(
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
-            problems.append(f"{labels[split]} names {photos} without a pose ({few}); correct the list.")
+            problems.append(f"{label(split)} names {photos} without a pose ({few}); correct the list.")
     problems.raise_if_any()
     listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
@@ -185,21 +185,17 @@ def split_lists(
     if not (train and held_out):
         side = "hold out" if train else "train on"
         fix = f"set {OPTION}eval-mode interval"
-        raise InputError(f"{next(iter(labels.values()))} leaves nothing to {side}; {fix}.")
+        raise InputError(f"{label(next(iter(found)))} leaves nothing to {side}; {fix}.")
     return SplitLists(train, held_out)
 
 
 def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
     """The split of train_list.txt, val_list.txt and test_list.txt in `data`: a photo's name in each line.
     `known` is the name of each frame, by what the model calls it."""
-    found, labels = {}, {}
-    for split in SPLITS:
-        path = data / f"{split}_list.txt"
+    paths, found = {split: data / f"{split}_list.txt" for split in SPLITS}, {}
+    for split, path in paths.items():
         if path.is_file():
-            try:
-                lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
-            except OSError as error:
-                raise InputError(f"{path} cannot be read ({error.strerror}); remove or replace it.") from None
+            lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
             found[split] = [line.strip() for line in lines if line.strip()]
-            labels[split] = str(path)
-    return split_lists(found, {name: name for name in known.values()} | dict(known), labels)
+    known = {name: name for name in known.values()} | dict(known)
+    return split_lists(found, known, lambda split: str(paths[split]))

@@ -107,7 +107,7 @@ def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folde
     # As for the frames' own file_paths, the ending may be left out.
     called = {photo.removesuffix(".png"): photo for photo in photos} | called | {p: p for p in photos}
     known = {call: os.path.relpath(photo, folder) for call, photo in called.items()}
-    return split_lists(found, known, {split: f"{path}: {split}_filenames" for split in found})
+    return split_lists(found, known, lambda split: f"{path}: {split}_filenames")
 
 
 def _number(values: dict[str, Any], key: str, label: object, default: float | None = None) -> float:
