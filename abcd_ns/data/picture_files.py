@@ -46,7 +46,7 @@ class FileFinder:
     perhaps. No path leads out of the folder. The check is by name: a link inside may point anywhere."""
 
     def __init__(self, folder: Path, said_by: Path):
-        self.folder, self.said_by = folder, said_by
+        self.folder, self.said_by, self._root = folder, said_by, Path(os.path.abspath(folder))
         self._renamed: dict[str, Path] = {}
 
     def find(self, name: str, moved: bool = True) -> Path:
@@ -57,8 +57,8 @@ class FileFinder:
             os.fsencode(name)
         except UnicodeEncodeError:
             raise InputError(f"{self.said_by}: no file can have the name {name}; correct the path.") from None
-        path = Path(os.path.abspath(self.folder / name))
-        leaves = "\0" in name or not path.is_relative_to(os.path.abspath(self.folder))
+        path = Path(os.path.abspath(self._root / name))
+        leaves = "\0" in name or not path.is_relative_to(self._root)
         if not leaves and os.path.lexists(path):
             return path
         parts = [part for part in PureWindowsPath(name).parts if part != ".."]
@@ -79,16 +79,15 @@ class FileFinder:
         if not self._renamed:
             return []
         name, path = next(iter(self._renamed.items()))
-        example = f"{name} is {path.relative_to(os.path.abspath(self.folder))}"
+        example = f"{name} is {path.relative_to(self._root)}"
         return [f"{self.said_by}: {len(self._renamed)} files have other names ({example}, ...)."]
 
     @cached_property
     def _files(self) -> dict[str, list[Path]]:
         """All files by their path inside the folder, and pictures by it without the ending, too."""
         found: dict[str, list[Path]] = {}
-        root = Path(os.path.abspath(self.folder))
-        for path in visible_files(root):
-            key = _loosely(path.relative_to(root).as_posix())
+        for path in visible_files(self._root):
+            key = _loosely(path.relative_to(self._root).as_posix())
             for each in {key, _without_ending(key)}:
                 found.setdefault(each, []).append(path)
         return found

@@ -28,13 +28,13 @@ pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs
 def make(tmp_path, views, photos):
     """Makes the run that `steady` is of, by two workers; `target` is told of each sample."""
 
-    def made(target=lambda _: None):
+    def made(target=lambda _: None, rasterizer=TorchRasterizer()):  # noqa: B008
         def watched(sample):
             target(sample)
             return photos(sample.view.index, sample.crop), None
 
         def workers_of(run):
-            return ForkedWorkers(2, VisitWorker(setup_of(run), TorchRasterizer(), watched))
+            return ForkedWorkers(2, VisitWorker(setup_of(run), rasterizer, watched))
 
         return make_run(tmp_path / "forked", views, workers_of, lag=4, density=GROWING)
 
@@ -167,16 +167,9 @@ class Slow(TorchRasterizer):
             yield cut
 
 
-def test_one_that_draws_layers_for_long_is_not(tmp_path, views, photos, monkeypatch):
+def test_one_that_draws_layers_for_long_is_not(make, views, photos, monkeypatch):
     monkeypatch.setattr(forked_workers, "SILENCE", 1.5)
-
-    def target(sample):
-        return photos(sample.view.index, sample.crop), None
-
-    def workers_of(run):
-        return ForkedWorkers(2, VisitWorker(setup_of(run), Slow(), target))
-
-    run = make_run(tmp_path / "slow", views, workers_of, lag=4, density=GROWING)
+    run = make(rasterizer=Slow())
     lost = listen(run, WorkerLost)
     while run.state.visit < 3:
         train_step(run, photos)
@@ -203,17 +196,13 @@ def test_any_other_error_ends_the_run_in_one_line(make, photos, tmp_path, error,
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_no_worker_outlives_the_training_process(tmp_path, views, held):
+def test_no_worker_outlives_the_training_process(make, held):
     """Not even one that is killed; `kill -9` runs no handler. Nor does one that stands still."""
-
-    def workers_of(run):
-        return ForkedWorkers(2, VisitWorker(setup_of(run), TorchRasterizer(), lambda _: time.sleep(600)))
-
     reads, writes = os.pipe()
     driver = os.fork()
     if driver == 0:
         try:
-            run = make_run(tmp_path / "run", views, workers_of)
+            run = make(lambda _: time.sleep(600))
             run._assign()
             if held:
                 run.workers.hold()
