@@ -33,34 +33,24 @@ class VisitTask:
     active: ActiveVisit
     tree: BlockTree
     counts: list[int]
-    bounds: list[Box | None]
-    """See BlockScene; of all blocks, as the visit is assigned."""
-    step: int
-    """Steps of the run before the visit's first one."""
-    seconds: float
-    """Training time when it begins."""
+    bounds: list[Box | None]  # see BlockScene; of all blocks, as the visit is assigned
+    step: int  # steps of the run before the visit's first one
+    seconds: float  # training time when it begins
     epoch: int
     health: BlockHealth
-    light: dict[int, Tensor]
-    """By view in use, its transform, on the CPU; the worker leaves it as it is. Empty without any."""
-    poses: dict[str, str]
-    """As in RunState; likewise."""
-    beside: dict[int, float]
-    """See `shown_beside`."""
-    allowance: int | None
-    """Gaussians by which the block may grow within the scene's limit; None for any number."""
+    light: dict[int, Tensor]  # by view in use, its transform, on the CPU; empty without any
+    poses: dict[str, str]  # as in RunState; likewise
+    beside: dict[int, float]  # see `shown_beside`
+    allowance: int | None  # Gaussians by which the block may grow; None for any number
 
 
 @dataclass(frozen=True)
 class VisitOutcome:
     """What became of a block."""
 
-    state: BlockState
-    """On the CPU; Gaussians that left the cell are still among them."""
-    done: int
-    """Steps taken."""
-    shown: dict[int, float]
-    """The influence that the block has on views that were doubtful."""
+    state: BlockState  # on the CPU; Gaussians that left the cell are still among them
+    done: int  # steps taken
+    shown: dict[int, float]  # the influence that the block has on views that were doubtful
     health: BlockHealth
     layer_seconds: float
 
@@ -69,8 +59,7 @@ class VisitOutcome:
 class Parcel:
     """An outcome on its way between processes: its tensors as arrays, which pickle does not copy."""
 
-    outcome: VisitOutcome
-    """Without its Gaussians."""
+    outcome: VisitOutcome  # without its Gaussians
     arrays: dict[str, np.ndarray]
     meta: dict[str, Any]
 
@@ -91,13 +80,10 @@ class Parcel:
 class Assignment:
     """A visit assigned to a worker. It ends when the worker answers, or is given up."""
 
-    number: int
-    """No other assignment of the run has it, so that late answers to one that was given up are known."""
+    number: int  # no other one of the run has it, so that late answers are known
     task: VisitTask
-    state: Callable[[], BlockState]
-    """Reads what the visit begins with, wherever the worker is."""
-    drawn: Drawn
-    """Likewise all blocks, this one too."""
+    state: Callable[[], BlockState]  # reads what the visit begins with, wherever the worker is
+    drawn: Drawn  # likewise all blocks, this one too
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from abcd_ns.errors import first_line
 LOOPBACK = "127.0.0.1"
 ON_LOOPBACK = ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 """Without it Ray takes an interface that others can reach, whatever address it is given."""
-STARTS = 3
-"""Attempts to start Ray, which gives its own processes half a minute: little on a machine that is busy."""
+STARTS = 3  # attempts to start Ray, which gives its own processes half a minute
 
 
 def check_installed() -> None:

@@ -38,12 +38,10 @@ from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
 
-SILENCE = 600.0
-"""Seconds without a word after which a worker counts as lost: a view of large blocks may take many."""
+SILENCE = 600.0  # seconds without a word after which a worker counts as lost
 FIRST_WORD = 5.0  # seconds in which a process that was just forked says that it lives
 TELL_EVERY = 0.5  # seconds between two words of a worker's progress
-PR_SET_PDEATHSIG = 1
-"""Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
+PR_SET_PDEATHSIG = 1  # of Linux' prctl: a signal for this process when its parent ends, however that ends
 
 
 def can_fork(device: torch.device) -> bool:

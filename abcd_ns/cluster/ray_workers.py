@@ -39,11 +39,9 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, first_line, is_out_of_memory
 from abcd_ns.machine import own_commit
 
-SILENCE, SLOW_START = 60.0, 600.0
-"""Seconds after which a worker that does not answer, or does not begin, counts as lost."""
+SILENCE, SLOW_START = 60.0, 600.0  # seconds until a worker that is silent, or never begins, is lost
 LOOK_EVERY = 1.0  # seconds between two questions
-STARTS = 3
-"""Workers in a row that may end before they are ready; then there is something wrong with all of them."""
+STARTS = 3  # workers in a row that may end before they are ready
 FULL = (of_ray.ObjectStoreFullError, of_ray.OutOfDiskError)
 
 
@@ -52,8 +50,7 @@ class Shared:
     """Gaussians or a block in Ray's object store: calling it reads them; here without a copy."""
 
     ref: ray.ObjectRef
-    meta: dict[str, Any] | None
-    """Of a block; None for Gaussians."""
+    meta: dict[str, Any] | None  # of a block; None for Gaussians
 
     @staticmethod
     def of(value: Gaussians | BlockState) -> "Shared":

@@ -27,8 +27,7 @@ from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 
 FAINT = 0.01  # weight that a block is given in every pixel, so that shares exist where no block shows
-ROOM = 10 / 26
-"""Of the room for layers, for pictures that visits begin with: 5 numbers a pixel, where F and B have 8."""
+ROOM = 10 / 26  # of that for layers, for pictures: 5 numbers a pixel, where F and B have 8
 
 
 def shares(

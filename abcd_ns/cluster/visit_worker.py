@@ -39,10 +39,8 @@ class RunSetup:
     config: TrainingConfig
     budget: Budget
     views: list[View]
-    optimizers: dict[str, dict[str, Any]]
-    """By parameter, Adam's options before the first step."""
-    layer_room: LayerRoom
-    """Of each worker."""
+    optimizers: dict[str, dict[str, Any]]  # by parameter, Adam's options before the first step
+    layer_room: LayerRoom  # of each worker
 
     @staticmethod
     def of(run: TrainingRun, layer_room: LayerRoom) -> "RunSetup":

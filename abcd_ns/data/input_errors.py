@@ -9,8 +9,7 @@ from rich.markup import escape
 from abcd_ns.errors import UserError
 
 SHOWN = 20  # lines of one error that are shown; the others are counted
-FEW = 3
-"""Files with the same fault that are named; of more, the first is named and the others are counted."""
+FEW = 3  # files with the same fault that are named; of more, others than the first are counted
 
 
 def one_line(text: str) -> str:

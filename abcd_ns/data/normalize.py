@@ -19,10 +19,8 @@ Center = Literal["poses", "focus", "none"]
 class Similarity:
     """x becomes scale x (rotation x + translation), in nerfstudio's order."""
 
-    rotation: np.ndarray
-    """float64 [3, 3]."""
-    translation: np.ndarray
-    """float64 [3], before scaling."""
+    rotation: np.ndarray  # float64 [3, 3]
+    translation: np.ndarray  # float64 [3], before scaling
     scale: float
 
     def points(self, xyz: np.ndarray) -> np.ndarray:

@@ -24,8 +24,7 @@ from abcd_ns.data.picture_files import has_alpha, open_picture, undecodable
 from abcd_ns.data.undistort import Undistortion
 
 READERS = 4  # threads that decode what is expected
-FEWEST_AHEAD = 12
-"""Photos that are read ahead of requests, beyond the budget: a step's, and those of the next."""
+FEWEST_AHEAD = 12  # photos that are read ahead beyond the budget: those of a step and of the next
 _MASK_USED = 255
 _LOSSY = ("JPEG", "MPO", "WEBP")
 _Key = tuple[Literal["image", "mask"], int]  # what is read, and of which source
@@ -36,8 +35,7 @@ class PhotoSource:
     """How one file becomes the photo of its camera: decode, reduce, undistort."""
 
     path: Path
-    stored: tuple[int, int]
-    """(width, height) that the file must have; EXIF orientation is not applied."""
+    stored: tuple[int, int]  # (width, height) that the file must have; EXIF orientation is not applied
     reduced: tuple[int, int]
     """(width, height) after area averaging; equal to `stored` where nothing is to be reduced."""
     undistortion: Undistortion | None = None

@@ -28,8 +28,7 @@ _COLORS = tuple(
 """What programs call colours, in lower case."""
 _HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 """What files of Gaussians have in their place: colour = 0.5 + Y00 x coefficient (Kerbl et al., 2023)."""
-_MOST = 20.0
-"""Of an opacity's logit, and of minus a scale's logarithm, which files may hold as infinite."""
+_MOST = 20.0  # of an opacity's logit, and of minus a scale's logarithm, which files may hold as infinite
 _RESTS = (0, 9, 24, 45)  # harmonics of a Gaussian above degree 0, three channels, for degrees 0 to 3
 _WHITES = (255, 65_535, 4_294_967_295)  # what the brightest colour may be
 _OVERSHOOT = 2  # times white: real numbers above it are still counted from that white, and clipped

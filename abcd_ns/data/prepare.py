@@ -25,8 +25,7 @@ from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read
 from abcd_ns.data.undistort import undistortion
 from abcd_ns.progress_bar import ProgressBar
 
-MAX_AUTO_SIDE = 1600
-"""Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
+MAX_AUTO_SIDE = 1600  # pixels along a photo's longer side: nerfstudio's MAX_AUTO_RESOLUTION
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 _MODEL_FILES = ("cameras.bin", "cameras.txt", f"{TRANSFORMS}.json", f"{TRANSFORMS}_train.json")
 """By which a model is found where nobody looks for it."""
@@ -72,20 +71,14 @@ class Prepared:
 
     scene: Scene
     sources: list[PhotoSource]
-    lenses: list[Lens]
-    """Final cameras: reduced, undistorted."""
-    factor: int
-    """By which the photos' width and height were to be divided."""
-    similarity: Similarity
-    """From the scene's world to that of training."""
+    lenses: list[Lens]  # final cameras: reduced, undistorted
+    factor: int  # by which the photos' width and height were to be divided
+    similarity: Similarity  # from the scene's world to that of training
     points: dict[str, Tensor]
     """points3D_xyz float32 [n, 3], world of training, and points3D_rgb uint8 [n, 3]; empty without any."""
-    points_in_model: np.ndarray
-    """The same points, float64 [n, 3], in the scene's world."""
-    notes: tuple[str, ...]
-    """What the user should know but need not repair."""
-    chosen: tuple[str, ...] = ()
-    """What was chosen where the user said nothing."""
+    points_in_model: np.ndarray  # the same points, float64 [n, 3], in the scene's world
+    notes: tuple[str, ...]  # what the user should know but need not repair
+    chosen: tuple[str, ...] = ()  # what was chosen where the user said nothing
 
 
 def read_scene(options: SceneOptions) -> Scene:

@@ -29,8 +29,7 @@ class Lens:
     cy: float
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients: k1 k2 p1 p2 k3 k4 k5 k6 (or fewer), for a fisheye k1 k2 k3 k4."""
-    fisheye: bool = False
-    """Equidistant projection, as OpenCV's fisheye module has it."""
+    fisheye: bool = False  # equidistant projection, as OpenCV's fisheye module has it
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,8 +58,7 @@ class Lens:
 class Frame:
     """One posed photo."""
 
-    name: str
-    """Path of the photo inside the photo folder; the order of frames is the order of names."""
+    name: str  # path of the photo inside the photo folder; the order of frames is the order of names
     camera_to_world: np.ndarray
     """float64 [3, 4], OpenGL convention (x right, y up, z backward), world of the Scene."""
     lens: Lens
@@ -84,24 +82,19 @@ class SplitLists:
 class Scene:
     """All that a model file says. Frames are sorted by name."""
 
-    model: Path
-    """The file or folder that was read, for messages."""
-    root: Path
-    """The data root; no path leads out of it."""
+    model: Path  # the file or folder that was read, for messages
+    root: Path  # the data root; no path leads out of it
     photo_folder: Path
     """Holds the photos. Reduced copies may lie beside it, as in images_4."""
     frames: list[Frame]
-    points_xyz: np.ndarray
-    """float64 [n, 3], world of the Scene."""
-    points_rgb: np.ndarray | None
-    """uint8 [n, 3]; None where the model gives no colours."""
+    points_xyz: np.ndarray  # float64 [n, 3], world of the Scene
+    points_rgb: np.ndarray | None  # uint8 [n, 3]; None where the model gives no colours
     applied_transform: np.ndarray = field(default_factory=lambda: np.eye(4)[:3])
     """float64 [3, 4]: world of the Scene = applied_scale x (applied_transform @ original coordinates)."""
     applied_scale: float = 1.0
     split_lists: SplitLists | None = None
     """Which frames are trained on and which are held out, if the data say so."""
-    notes: list[str] = field(default_factory=list)
-    """What the user should know but need not repair."""
+    notes: list[str] = field(default_factory=list)  # what the user should know but need not repair
 
 
 def check_lens(lens: Lens, label: str) -> None:

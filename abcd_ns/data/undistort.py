@@ -19,10 +19,8 @@ class Undistortion:
     """What OpenCV needs to turn a photo of `lens` into one of `pinhole`."""
 
     lens: Lens
-    pinhole: Lens
-    """The result: no distortion, and the size that is left after cropping to valid pixels."""
-    corner: tuple[int, int]
-    """Column and row of the result's first pixel before cropping."""
+    pinhole: Lens  # the result: no distortion, and the size that is left after cropping to valid pixels
+    corner: tuple[int, int]  # column and row of the result's first pixel before cropping
 
     def apply(self, image: np.ndarray) -> np.ndarray:
         """[lens.height, lens.width, c] to [pinhole.height, pinhole.width, c] of the same type, bilinear."""

@@ -12,8 +12,7 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
 
-BYTES_AT_ONCE = 1000
-"""RAM that a Gaussian of degree 3 needs while it is packed: its row, and up to 755 bytes (.spz), measured."""
+BYTES_AT_ONCE = 1000  # of RAM that a Gaussian of degree 3 needs while it is packed (.spz), measured
 
 
 def check_installed() -> None:

@@ -9,8 +9,7 @@ from abcd_ns import __version__
 from abcd_ns.engine.types import Gaussians
 
 GENERATOR = f"abcd_ns {__version__}"
-ANTIALIASED = "comment antialiased"
-"""A line of the header: opacities are to be compensated for the low-pass filter."""
+ANTIALIASED = "comment antialiased"  # opacities are to be compensated for the low-pass filter
 
 
 def columns(sh_degree: int) -> list[str]:

@@ -19,8 +19,7 @@ SUFFIXES = (*PACKED, ".ply", ".glb")  # the longer of two that fit comes first
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 """What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
 
-MOST_AT_ONCE = 4 * 2**30 // BYTES_AT_ONCE
-"""Gaussians that are packed only to see how small they become: 4 GiB of RAM."""
+MOST_AT_ONCE = 4 * 2**30 // BYTES_AT_ONCE  # packed only to see how small they become: 4 GiB of RAM
 
 
 def shows(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, "n"]:

@@ -46,8 +46,7 @@ from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 SURFACE_OPACITY = 0.9  # of the initial points where they stand for surfaces
-SURFACE_SCALE = 0.5
-"""Their size as such, as a share of what they begin with: outliers, which begin large, hide too much."""
+SURFACE_SCALE = 0.5  # their size as such: outliers, which begin large, hide too much
 BEYOND = 1e30  # camera z of a pixel that shows no point: further than any finite cell
 OWN, CLEAR = 1, 2
 """What a pixel is to a block, by where its surface lies. In the enlarged cell: the block explains the photo.

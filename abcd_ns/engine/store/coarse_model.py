@@ -20,8 +20,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians
 
-REVEALED_OPACITY = 0.02
-"""Of deferred Gaussians, once they are seen: enough to learn, too little to spoil what is there."""
+REVEALED_OPACITY = 0.02  # of deferred Gaussians, once they are seen: enough to learn, too little to spoil
 REVEALED_SCALE = 0.5  # their size, as a share of the distance to their neighbours
 
 

@@ -23,15 +23,11 @@ class Shard:
     """What the manifest says of one block."""
 
     file: str
-    generation: int
-    """The generation that wrote it: the block's version."""
+    generation: int  # the generation that wrote it: the block's version
     nbytes: int
-    checksum: str
-    """blake2b of the whole file, hexadecimal."""
-    rows: int
-    """Rows of the tensor "means"."""
-    meta: dict[str, Any]
-    """The block's JSON: known without opening the file."""
+    checksum: str  # blake2b of the whole file, hexadecimal
+    rows: int  # rows of the tensor "means"
+    meta: dict[str, Any]  # the block's JSON: known without opening the file
 
 
 @dataclass(frozen=True)

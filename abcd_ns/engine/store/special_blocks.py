@@ -12,8 +12,7 @@ DEFERRED = "deferred"  # deferred points: Gaussians that join at the end of the 
 ACTIVE = "live"  # its name in stores
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
-PENDING = "pending"
-"""Pending migrants: Gaussians that left their block and join another at its next visit."""
+PENDING = "pending"  # migrants: Gaussians that left their block and join another at its next visit
 
 
 def initial_of(block: int) -> str:

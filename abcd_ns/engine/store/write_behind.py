@@ -27,12 +27,9 @@ from abcd_ns.engine.store.special_blocks import BlockName
 class Snapshot:
     """What a commit brings: everything as it was at one moment between two steps. Nobody changes it."""
 
-    blocks: dict[BlockName, Packed]
-    """Those that have changed, and tables of the run's."""
-    header: dict[str, Any] | None
-    """None where it has not changed."""
-    state: dict[str, Any]
-    """The run's, as JSON."""
+    blocks: dict[BlockName, Packed]  # those that have changed, and tables of the run's
+    header: dict[str, Any] | None  # None where it has not changed
+    state: dict[str, Any]  # the run's, as JSON
 
     def after(self, earlier: "Snapshot | None") -> "Snapshot":
         """Both as one commit."""
