@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -86,8 +86,7 @@ class Assignment:
     drawn: Drawn  # likewise all blocks, this one too
 
 
-@dataclass(frozen=True)
-class StepsSeen:
+class StepsSeen(NamedTuple):
     """A worker has taken steps; `psnr` is the last one's, dB."""
 
     assignment: int
@@ -95,16 +94,14 @@ class StepsSeen:
     psnr: float
 
 
-@dataclass(frozen=True)
-class Finished:
+class Finished(NamedTuple):
     """A worker has answered."""
 
     assignment: int
     outcome: VisitOutcome
 
 
-@dataclass(frozen=True)
-class Lost:
+class Lost(NamedTuple):
     """A worker is gone, or too long silent, and its visit with it."""
 
     assignment: int

@@ -26,10 +26,8 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
     """Join the cluster whose head is at `address` (host:port), or start one here for as long as we live.
 
     One that is started listens on 127.0.0.1 alone, and asks for a token that only its own processes know. A
-    cluster's token is read where Ray looks for it: RAY_AUTH_TOKEN, or ~/.ray/auth_token.
-
-    Raises:
-        WorkersError: no Ray, no such cluster, or one that refuses us.
+    cluster's token is read where Ray looks for it: RAY_AUTH_TOKEN, or ~/.ray/auth_token. WorkersError says
+    that there is no Ray, no such cluster, or one that refuses us.
     """
     check_installed()
     keep_to_ourselves(address is None)

@@ -111,13 +111,8 @@ class Remote(Member):
 
 
 class RayWorkers(Workers):
-    """So many actors of the Ray cluster that this process is connected to; see `connect`.
-
-    Args:
-        make: called in each worker's process; reads what the run needs. Must be picklable.
-        gpus: of each worker, 1 or 0.
-        cores: of each worker where it has no GPU.
-    """
+    """So many actors of the Ray cluster that this process is connected to, each with `gpus` GPUs, 1 or 0, and
+    `cores`. `make`, which is pickled, is called in each worker's process and reads what the run needs."""
 
     def __init__(self, count: int, make: Callable[[], VisitWorker], *, gpus: int = 0, cores: int = 1) -> None:
         options = {"num_gpus": gpus, "num_cpus": cores, "max_concurrency": 2}

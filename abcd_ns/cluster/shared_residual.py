@@ -54,13 +54,8 @@ def shown_beside(
 
 
 class SharedResidual:
-    """The pictures that a visit begins with, and what its block is to add to them.
-
-    Args:
-        own: gives the block as others draw it: without what joins it in this visit.
-        beside: see `shown_beside`.
-        room: for pictures. What has none is drawn again when it is needed.
-    """
+    """The pictures that a visit begins with, and what its block is to add to them. `own` gives the block as
+    others draw it: without what joins it in this visit. Pictures without `room` are drawn when needed."""
 
     def __init__(
         self,

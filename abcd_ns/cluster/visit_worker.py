@@ -133,13 +133,8 @@ class VisitWorker:
         listen: Callable[[Event], None] = lambda _: None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> VisitOutcome:
-        """Train a block between the others.
-
-        Args:
-            state: what it begins with.
-            drawn: by block, what reads it as others draw it; only what some picture shows is read.
-            clock: of training time.
-        """
+        """Train a block, which begins with `state`, between the others, of which only those that some picture
+        shows are read. `clock` is of training time."""
         scene = AssignedScene(task, state, drawn)
         run = self._run_of(task, scene)
         run.announce.subscribe(listen)

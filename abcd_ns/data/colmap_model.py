@@ -150,9 +150,6 @@ def _unsupported(path: Path, number: int, model: object) -> InputError:
     return InputError(f"{path}: camera {number} has the model {model}, not one of {names}; {fix}.")
 
 
-# Binary
-
-
 class _Cursor:
     """Reads a binary file front to back and never past its end."""
 
@@ -245,9 +242,6 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
         points = raw[starts[part, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
         xyz[part], rgb[part] = points["xyz"], points["rgb"]
     return xyz, rgb
-
-
-# Text
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

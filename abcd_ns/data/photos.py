@@ -57,13 +57,9 @@ def default_budget() -> int:
 
 
 class Photos:
-    """The photos of a set of cameras. Safe to use from several threads.
-
-    Args:
-        sources: one per camera; pixels depend on these alone.
-        budget_bytes: how much decoded pixels may stay in memory between calls; None means
-            `default_budget()`. With 0 every call reads the file.
-    """
+    """The photos of a set of cameras, by one source each, which alone decides their pixels. Safe to use from
+    several threads. Between calls, `budget_bytes` of decoded pixels may stay in memory: with None
+    `default_budget()`, and with 0 every call reads the file."""
 
     def __init__(self, sources: Sequence[PhotoSource], budget_bytes: int | None = None):
         self.sources = tuple(sources)

@@ -153,13 +153,8 @@ def split_lists(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
 ) -> SplitLists | None:
     """The lists that there are as one split; None without any. What is held out is val and test together. If
-    only one side is listed, the other is all the rest.
-
-    Args:
-        found: by split, what its list names.
-        known: the name of each frame, by what lists call it.
-        label: what messages call the list of a split.
-    """
+    only one side is listed, the other is all the rest. `found` is what each list names, `known` the name of
+    each frame by what lists call it, and `label` what messages call the list of a split."""
     if not found:
         return None
     problems, everything = Problems(), frozenset(known.values())

@@ -81,12 +81,8 @@ def write_glb(
     parts: Iterable[Gaussians],
     antialiased: bool = False,
 ) -> None:
-    """Write Gaussians as they come, `count` in all, unless UserError says that one file cannot hold them.
-
-    Args:
-        up: turns the Gaussians' frame so that y is up. A node of the file has it; values stay as they are.
-        antialiased: noted in the extras of the primitive; the extension has no field for it.
-    """
+    """As `write_scene`; UserError where one file cannot hold them. A node of the file has `up`, and values
+    stay as they are. `antialiased` is noted in extras; the extension has no field for it."""
     columns = attributes(sh_degree)
     starts = list(accumulate((column.stride * count for column in columns), initial=0))
     document = _document(columns, starts, count, up)

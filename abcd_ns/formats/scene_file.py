@@ -58,12 +58,8 @@ def write_scene(
     parts: Iterable[Gaussians],
     antialiased: bool = False,
 ) -> None:
-    """Write Gaussians as they come, `count` in all, in the format of a suffix.
-
-    Args:
-        up: turns the Gaussians' frame so that y is up.
-        antialiased: mark the file so: its opacities are to be compensated for the low-pass filter.
-    """
+    """Write Gaussians as they come, `count` in all, in the format of a suffix. `up` turns their frame so that
+    y is up; `antialiased` marks the file: opacities are to be compensated for the low-pass filter."""
     if suffix == ".ply":
         write_ply(path, count, sh_degree, parts, antialiased)
     elif suffix == ".glb":

@@ -163,8 +163,6 @@ class ExactTrainer(Trainer):
         self.run.restore()
         self._take()
 
-    # -- blocks --------------------------------------------------------------------------------------
-
     def _take(self) -> None:
         self._all = join([self.scene.state(block) for block in range(self.scene.tree.num_blocks)])
 

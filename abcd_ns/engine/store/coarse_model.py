@@ -50,12 +50,8 @@ def by_block(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[i
 def stored_blocks(
     tree: BlockTree, start: Gaussians | PointCloud, room: int | None = None, seed: int = 0
 ) -> Iterator[tuple[BlockName, Packed]]:
-    """The first content of a store: `start` parted by `tree`, nothing trained yet; one block at a time.
-
-    Args:
-        start: points where there is a warm-up.
-        room: for Gaussians in the coarse model; others are deferred. None for no warm-up.
-    """
+    """The first content of a store: `start` parted by `tree`, nothing trained yet; one block at a time. With
+    a warm-up, `start` is points, of which those beyond the coarse model's `room` are deferred."""
     if room is not None:
         start, deferred = split_off(start, room, seed)
         yield DEFERRED, pack_points(deferred)
