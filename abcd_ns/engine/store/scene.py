@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -78,10 +78,9 @@ class MemoryScene(BlockScene):
         owner = tree.assign(gaussians.means)
         if bool((owner.diff() < 0).any()):
             gaussians = gaussians[owner.argsort(stable=True)]
-        sizes = owner.bincount(minlength=tree.num_blocks).tolist()
-        ends = list(accumulate(sizes, initial=0))
+        ends = owner.bincount(minlength=tree.num_blocks).cumsum(dim=0).tolist()
         # Where they come block by block, as in a checkpoint, blocks share their memory.
-        self._blocks = [gaussians[start:end] for start, end in pairwise(ends)]
+        self._blocks = [gaussians[start:end] for start, end in pairwise([0, *ends])]
         self._bounds: dict[int, Box | None] = {}
 
     def gaussians(self, block: int) -> Gaussians:
@@ -101,10 +100,9 @@ class StoredScene(VisitScene):
     read stay in RAM, least recently used first out, within `ram_bytes`."""
 
     def __init__(self, tree: BlockTree, store: ParameterStore, ram_bytes: int = 2 << 30) -> None:
-        self.tree = tree
+        self.tree, self.ram_bytes = tree, ram_bytes
         self.store = store
         """What is durable; to be read and written by way of the scene alone while there is one."""
-        self.ram_bytes = ram_bytes
         self._memory = BlockMemory(ram_bytes)
         self._unsaved: dict[BlockName, Packed] = {}
         self._writer = WriteBehind(store, self._saved)
@@ -204,6 +202,11 @@ class StoredScene(VisitScene):
 
     # -- what is there -------------------------------------------------------------------------------
 
+    @property
+    def is_active_as_a_whole(self) -> bool:
+        """Whether all blocks are active, and `count` is right in sum alone."""
+        return self._is_active(None)
+
     def _is_active(self, block: int | None) -> bool:
         """Whether the block is, or all of them are; with None, whether all are."""
         return self._active is not None and self._active[0] in (None, block)
@@ -264,7 +267,7 @@ class StoredScene(VisitScene):
         if not self._is_active(block):
             return self.drawn(block, "cpu")
         active = self._all_active()
-        return active[self.tree.assign(active.means) == block] if self._is_active(None) else active
+        return active[self.tree.assign(active.means) == block] if self.is_active_as_a_whole else active
 
     def _all_active(self) -> Gaussians:
         active = self._active[1]().detach()
@@ -285,7 +288,7 @@ class StoredScene(VisitScene):
 
     def everything(self, device: torch.device | str) -> Gaussians:
         """All blocks, one after the other."""
-        if self._is_active(None):  # which block holds what is asked once
+        if self.is_active_as_a_whole:  # which block holds what is asked once
             active = self._all_active()
             return active[self.tree.assign(active.means).argsort(stable=True)].to(device)
         return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
@@ -317,7 +320,7 @@ class StoredScene(VisitScene):
         if not self._is_active(block):
             return self.rows(block) + len(self.pending_for(block) or ())
         # Right in sum. Which block holds what changes with every step, and is too slow to ask that often.
-        return 0 if self._is_active(None) and block > 0 else len(self._active[1]())
+        return 0 if self.is_active_as_a_whole and block > 0 else len(self._active[1]())
 
     def parameters(self) -> int:
         """Of all Gaussians, what is active included; harmonics count up to the degree of each."""
