@@ -53,8 +53,6 @@ PITCH, HALF = 72.0, 26.0
 """From house to house, and half a house, metres."""
 EYE = 2.0
 """Height of the cameras, metres."""
-CACHED = 32
-"""Stored blocks that have room in RAM."""
 PARAMETERS = 236
 """Bytes of a Gaussian."""
 STAGES = ("plan", "reading", "loading", "drawing", "folding, and Python", "steps", "commit")
@@ -89,6 +87,8 @@ class Args:
     """Of a picture, px; its height is two thirds."""
     modelled: int = 1600
     """Width of the pictures that the room for layers is modelled on, px."""
+    cached: int = 32
+    """Blocks that have room in RAM."""
     out: Path | None = None
     """Gets all numbers."""
 
@@ -178,7 +178,7 @@ def options(blocks: int, args: Args) -> RunOptions:
         batch=4,
         density=DensityConfig(max_gaussians=blocks * args.gaussians),
     )
-    ram = 4 * CACHED * args.gaussians * PARAMETERS / GIB
+    ram = 4 * args.cached * args.gaussians * PARAMETERS / GIB
     return RunOptions(training, blocks=blocks, workers=1, ram_budget_gb=ram)
 
 

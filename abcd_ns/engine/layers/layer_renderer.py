@@ -5,9 +5,10 @@ block tree, drawn from all Gaussians that reach into it, so that folding layers 
 With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any, Literal
 
 import torch
@@ -24,6 +25,8 @@ from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 Ownership = Literal["fragments", "means"]
+Visible = Mapping[int, Collection[int]]
+"""By view, the blocks that are drawn for it; views that are missing have all."""
 PARTS_BYTES = 256 << 20
 """Size of the layers held while nodes are folded, at most, unless those of a single view are larger, or there
 is more room for them. Each group of views that has room loads the nodes that it sees once."""
@@ -137,14 +140,22 @@ class LayerRenderer:
         return tuple(self._descend(0, exclude))
 
     def shown(
-        self, nodes: Iterable[int], seen: Sequence[tuple[View, Crop]], exclude: int | None = None
+        self,
+        nodes: Iterable[int],
+        seen: Sequence[tuple[View, Crop]],
+        exclude: int | None = None,
+        visible: Visible = MappingProxyType({}),
     ) -> dict[int, Shown]:
-        """What these crops may show of each node, by the bounds of all blocks; nothing of `exclude`."""
+        """What these crops may show of each node, by the bounds of visible blocks; nothing of `exclude`."""
         slack, is_by_means = self.rasterizer.slack, self.ownership == "means"
         frusta, optics = Frusta(seen, slack), Optics([view for view, _ in seen], slack)
         bounds = {b: self.scene.bounds(b) for b in range(self.tree.num_blocks) if b != exclude}
         bounds = {block: box for block, box in bounds.items() if box is not None}
         blocks, boxes = torch.tensor(list(bounds)), optics.drawn_within(list(bounds.values()))
+        wanted = torch.ones(len(blocks), len(seen), dtype=torch.bool)
+        for column, (view, _) in enumerate(seen):
+            if view.index in visible:
+                wanted[:, column] = torch.isin(blocks, torch.tensor(visible[view.index]))
         cache = LRUCache(STRADDLERS_BYTES, getsizeof=lambda gaussians: gaussians.nbytes)
         straddlers, found = cached(cache)(partial(self._straddlers, optics)), {}
         for node in nodes:
@@ -152,7 +163,7 @@ class LayerRenderer:
             meets, parts = shared(boxes, space)
             if is_by_means:
                 meets, parts = torch.isin(blocks, torch.tensor(leaves)), boxes
-            shows, crops = frusta.crops(parts[meets])
+            shows, crops = frusta.crops(parts[meets], wanted[meets])
             some = blocks[meets][shows.any(dim=1)].tolist()
             own = [block for block in leaves if block in some]
             if is_by_means:

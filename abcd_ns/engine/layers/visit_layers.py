@@ -14,6 +14,7 @@ from abcd_ns.engine.layers.layer_renderer import (
     LayerRenderer,
     RenderSettings,
     Seen,
+    Visible,
 )
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.render import ZWindow
@@ -29,6 +30,7 @@ class VisitLayers:
         own: the block's Gaussians when the visit began; they decide the windows.
         window_weight: see Recipe.
         views: all views, by index.
+        visible: see LayerRenderer.
         parts_bytes: size of the layers held while nodes are folded, beside what is free in the store.
         backwards: load nodes in the opposite order. Where visits alternate, what the one before read last is
             still in RAM.
@@ -42,6 +44,7 @@ class VisitLayers:
         own: Gaussians,
         views: Mapping[int, View],
         settings: RenderSettings,
+        visible: Visible,
         *,
         window_weight: float,
         parts_bytes: int,
@@ -55,7 +58,7 @@ class VisitLayers:
         self._own = own if renderer.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
         seen = [(views[view], crop) for view, crop in sorted(geometry.crops.items())]
-        self._shown = renderer.shown(self._nodes, seen, exclude=geometry.block)
+        self._shown = renderer.shown(self._nodes, seen, geometry.block, visible)
         self._windows: dict[int, ZWindow] = {}
         self._sum: Tensor | float = 0.0
 

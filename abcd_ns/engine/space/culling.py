@@ -68,9 +68,12 @@ class Frusta:
         """
         return self._look(boxes, rows)[0]
 
-    def crops(self, boxes: Float64[Tensor, "n 2 3"]) -> tuple[Bool[Tensor, "n v"], dict[int, Crop]]:
-        """`may_show`, and by the views' indices the pixels of the crops in which it may be."""
+    def crops(
+        self, boxes: Float64[Tensor, "n 2 3"], wanted: Bool[Tensor, "n v"]
+    ) -> tuple[Bool[Tensor, "n v"], dict[int, Crop]]:
+        """`may_show` where that is wanted, and by views' indices the pixels of the crops where it may be."""
         shows, xy, z = self._look(boxes)
+        shows &= wanted
         if not len(boxes):
             return shows, {}
         xy = xy / z[:, :, None]

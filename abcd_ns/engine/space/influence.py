@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float, Int
@@ -28,6 +29,8 @@ they compute."""
 COARSE, COARSE_SIDE = 2, 80
 """Influences of whole views are found in images that are so many times smaller, and those of large images in
 such as are about so many pixels long: what counts is the order of a block's views, and there may be many."""
+UNSEEN = 2e-4
+"""Influence that blocks may have together on a view whose layers leave them out."""
 TINY = 1e-30
 """Keeps a block that no view shows from being divided by."""
 DIGITS = 6
@@ -186,6 +189,19 @@ def overlaps(influence: Influence, blocks: Iterable[int], others: Iterable[int])
 def coarser(view: View, times: int) -> View:
     """The same camera with an image that is `times` smaller, rounded up to whole pixels."""
     return view.resized(1 / times, -(-view.width // times), -(-view.height // times))
+
+
+def visible_blocks(influence: Influence, views: Iterable[int], blocks: int) -> dict[int, tuple[int, ...]]:
+    """By view, all of the `blocks` but those that together are UNSEEN of the picture, as where others hide
+    them. Blocks of which nothing is known count as visible; such views are left out."""
+    found = {}
+    for view in views:
+        shares = {block: known.get(view, 0.0) for block, known in influence.items()}
+        ranked = sorted(shares, key=lambda block: (shares[block], block))
+        hidden = sum(held <= UNSEEN for held in accumulate(shares[block] for block in ranked))
+        if hidden < len(ranked):
+            found[view] = tuple(sorted(set(range(blocks)).difference(ranked[:hidden])))
+    return found
 
 
 def worth_training(views: Mapping[int, float], share: float) -> tuple[int, ...]:

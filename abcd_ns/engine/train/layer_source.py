@@ -47,6 +47,7 @@ def layers_of_visit(
         run.scene.stored_with_pending(active.geometry.block),
         run.views,
         RenderSettings(active.sh_degree, config.antialiased),
+        active.visible,
         window_weight=config.recipe.window_weight,
         parts_bytes=parts_bytes(run, run.views.values(), blocks=2),
         backwards=active.number % 2 == 1,

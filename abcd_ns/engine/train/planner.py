@@ -10,7 +10,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
-from abcd_ns.engine.space.influence import overlaps, worth_training
+from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
 from abcd_ns.engine.space.tree import in_float64
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
@@ -180,6 +180,7 @@ class Planner(Visits):
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
             views=(*chosen, *looked_at),
+            visible=visible_blocks(state.influence, geometry.views, self._scene.tree.num_blocks),
             batch=plan.batch,
             looked_at=looked_at,
             showing=showing,

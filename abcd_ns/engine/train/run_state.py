@@ -67,6 +67,8 @@ class ActiveVisit:
     showing: tuple[int, ...] = ()
     """Indices of the views that are worth training the block on, of which each visit uses some; empty where
     they are all in use."""
+    visible: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    """By view, the blocks that its layers show, see `influence.visible_blocks`; missing views show all."""
     looked_at: tuple[int, ...] = ()
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0

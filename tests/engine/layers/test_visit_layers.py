@@ -41,6 +41,7 @@ def visit_layers(
         own,
         {view.index: view for view in views},
         RenderSettings(sh_degree=1),
+        {},
         window_weight=0.05,
         parts_bytes=parts_bytes,
         backwards=backwards,

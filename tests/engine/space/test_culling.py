@@ -48,7 +48,9 @@ def test_what_may_not_show_draws_nothing(seed, size, where, crop):
     gaussians.means[:] = gaussians.means + torch.tensor(where, dtype=torch.float64)
     views = ring_of_views(3, dtype=torch.float64)
     seen = [(view, crop or view.full) for view in views]
-    shows, crops = Frusta(seen, DRAW.slack).crops(corners(bounds_of(gaussians)))
+    shows, crops = Frusta(seen, DRAW.slack).crops(
+        corners(bounds_of(gaussians)), torch.ones(1, len(seen), dtype=torch.bool)
+    )
     for (view, crop), shown in zip(seen, shows[0].tolist(), strict=True):
         drawn = DRAW(gaussians, view, crop=crop, sh_degree=0).layer
         if shown and (part := crops.get(view.index)) is not None:
