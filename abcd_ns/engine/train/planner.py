@@ -167,12 +167,15 @@ class Planner(Visits):
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
         asked = {view: views[view] for view in (*chosen, *doubted)}
-        found = self._footprints(block, asked, self._config.recipe.influence_share)
+        share = self._config.recipe.influence_share
+        found = self._footprints(block, asked, share)
         chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
         if not chosen:
             return None
         looked_at = doubted[:1]
         geometry = VisitGeometry(block, {view: found.crops[view] for view in (*chosen, *looked_at)})
+        known = state.influence if share < 1 else {}
+        visible = visible_blocks(known, geometry.views, self._scene.tree.num_blocks)
         return ActiveVisit(
             number=state.visit,
             kind=VisitKind.BLOCK,
@@ -180,7 +183,7 @@ class Planner(Visits):
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
             views=(*chosen, *looked_at),
-            visible=visible_blocks(state.influence, geometry.views, self._scene.tree.num_blocks),
+            visible=visible,
             batch=plan.batch,
             looked_at=looked_at,
             showing=showing,

@@ -27,7 +27,8 @@ class Recipe:
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
-    share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
+    share of what it weighs there alone. 1 takes all views and pixels that it may touch, and layers of all
+    blocks."""
     visit_views: int = 64
     """Views that a visit uses of a block that as many views see as the median block. Others use the same
     share of theirs, and twice as many at most."""

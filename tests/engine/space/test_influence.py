@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.space.influence import (
+    UNSEEN,
     InfluenceTable,
     coarser,
     influence,
     overlaps,
     share_shown,
+    visible_blocks,
     weights,
     weights_by_pixel,
     worth_training,
@@ -114,6 +116,22 @@ def test_the_fewest_views_that_hold_the_share(views, share):
         smallest = min(views[view] for view in kept)
         assert held - smallest <= share * total * (1 + 1e-9)
         assert all(views[view] <= smallest for view in views if view not in kept)
+
+
+@given(st.dictionaries(st.integers(0, 9), st.floats(0, 1), max_size=8))
+def test_blocks_that_a_view_hardly_shows_are_not_visible(shares):
+    influence = {block: {7: share} for block, share in shares.items()} | {10: {8: 0.1}}
+    visible = visible_blocks(influence, [7], blocks=12).get(7, range(12))
+    hidden = [shares.get(block, 0.0) for block in range(12) if block not in visible]
+    assert 11 in visible  # nothing is known of it
+    assert sum(hidden) <= UNSEEN
+    if hidden:
+        assert 10 not in visible
+        smallest = min(shares[block] for block in visible if block in shares)
+        assert max(hidden) <= smallest
+        assert sum(hidden) + smallest > UNSEEN
+    else:
+        assert sum(shares.values()) <= UNSEEN
 
 
 def test_blocks_overlap_where_the_same_views_show_them():

@@ -4,10 +4,15 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
+from abcd_ns.engine.train.coordinator import influence_on
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.lab.world.world import camera
+from tests.engine.train.test_coordinator import off_from_merged
 from tests.reference.scenes import STILL, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 PRICED = DensityConfig(min_contribution=1.0, refine_every=1000)
@@ -163,3 +168,33 @@ def test_a_block_looks_at_a_doubtful_view_that_sees_it(grown, monkeypatch):
     active = coordinator.visits.begin()
     assert active.views == (0, 3)
     assert active.looked_at == (3,)
+
+
+def test_a_block_that_a_wall_hides_is_neither_read_nor_drawn(tmp_path, monkeypatch):
+    y, z = torch.cartesian_prod(*[torch.linspace(-2, 2, 20)] * 2).unbind(1)
+    places = torch.stack((torch.zeros_like(y), y, z), dim=1)
+    wall = cloud_from_points(places, torch.zeros_like(places), sh_degree=1).gaussians()
+    wall.opacities.fill_(6.0), wall.scales.add_(0.7)
+    before, behind = random_gaussians(200, size=0.05), random_gaussians(600, seed=1, size=0.05)
+    before.means[:, 0] += 2.0
+    behind.means[:, 0] -= 8.0
+    views = [
+        camera((6.0, y, 0.0), (0.0, 0.0, 0.1), index, (48, 36), focal=2.0)
+        for index, y in enumerate((-0.4, 0.4))
+    ]
+    run = make_coordinator(
+        tmp_path, Gaussians.cat([wall, before, behind]), views, blocks=8, window_weight=0.0
+    )
+    hidden = {block for block in range(8) if float(run.scene.gaussians(block).means[:, 0].max()) < -5}
+    known = influence_on(run.run, whole_scene(run), run.scene.tree, [0, 1])
+    run.state.influence = {block: known.get(block, {}) for block in range(8)}
+    read, drawn = set[int](), run.scene.drawn
+    monkeypatch.setattr(run.scene, "drawn", lambda block, *more: read.add(block) or drawn(block, *more))
+    for _ in range(8):
+        read.clear()
+        batch = run.next_batch()
+        assert read == set(range(8)) - hidden - {run.state.active.geometry.block}
+        rendered = run.render(batch)
+        assert all(float(off.mean()) < 5e-4 for off in off_from_merged(run, batch, rendered.pictures))
+        run.end_visit()
+    assert len(hidden) == 4
