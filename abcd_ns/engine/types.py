@@ -90,16 +90,8 @@ class Gaussians:
     @staticmethod
     def empty(sh_degree: int = 3, device: torch.device | str = "cpu", dtype=torch.float32) -> "Gaussians":
         """No Gaussians, with room for the given degree of spherical harmonics."""
-        k = (sh_degree + 1) ** 2 - 1
-        shapes = {
-            "means": (3,),
-            "scales": (3,),
-            "quats": (4,),
-            "features_dc": (3,),
-            "features_rest": (k, 3),
-            "opacities": (1,),
-        }
-        return Gaussians(**{n: torch.zeros((0, *s), device=device, dtype=dtype) for n, s in shapes.items()})
+        shapes = ((3,), (3,), (4,), (3,), ((sh_degree + 1) ** 2 - 1, 3), (1,))
+        return Gaussians(*(torch.zeros((0, *shape), device=device, dtype=dtype) for shape in shapes))
 
 
 assert tuple(f.name for f in fields(Gaussians)) == PARAM_NAMES
@@ -129,19 +121,15 @@ class Crop(NamedTuple):
     def joined(self, other: "Crop") -> "Crop":
         """The least crop that holds both."""
         x, y = min(self.x, other.x), min(self.y, other.y)
-        right, bottom = (
-            max(a.x + a.width for a in (self, other)),
-            max(a.y + a.height for a in (self, other)),
-        )
+        right = max(self.x + self.width, other.x + other.width)
+        bottom = max(self.y + self.height, other.y + other.height)
         return Crop(x, y, right - x, bottom - y)
 
     def shared(self, other: "Crop") -> "Crop | None":
         """The pixels of both; None where there are none."""
         x, y = max(self.x, other.x), max(self.y, other.y)
-        right, bottom = (
-            min(a.x + a.width for a in (self, other)),
-            min(a.y + a.height for a in (self, other)),
-        )
+        right = min(self.x + self.width, other.x + other.width)
+        bottom = min(self.y + self.height, other.y + other.height)
         return Crop(x, y, right - x, bottom - y) if x < right and y < bottom else None
 
     def within(self, outer: "Crop") -> "Crop":

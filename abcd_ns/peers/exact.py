@@ -26,10 +26,9 @@ from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.residual_sums import SUMS
-from abcd_ns.engine.space.culling import Optics
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import front_to_back
-from abcd_ns.engine.space.visibility import reaches
+from abcd_ns.engine.space.visibility import Optics, reaches
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.density.worth import Judged

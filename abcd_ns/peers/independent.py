@@ -31,7 +31,7 @@ from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render import Rasterizer
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.coarse_model import stored_blocks

@@ -14,7 +14,7 @@ from abcd_ns.cluster.assignment import Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
-from abcd_ns.engine.gaussians.initialize import PointCloud, cloud_from_points, thin_out, thin_points
+from abcd_ns.engine.gaussians.initialize import PointCloud, cloud_from_points, split_off, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer, loss
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
@@ -214,7 +214,8 @@ def _first_cloud(capture: Capture, training: TrainingConfig, say: Say) -> PointC
     if len(everything) < capture.points:
         merged = f"merged {capture.points:,} points closer than these photos resolve"
         say(f"Starting with {len(everything):,} Gaussians: {merged}.")
-    kept = thin_out(everything, training.density.limit, training.seed)
+    limit = training.density.limit
+    kept = everything if limit is None else split_off(everything, limit, training.seed)[0]
     if len(kept) < len(everything):
         say(f"Training begins with {len(kept):,} of {len(everything):,} Gaussians, the limit.")
     return kept

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.render import Rasterizer, TorchRasterizer, make_rasterizer
-from abcd_ns.engine.render.primitive import PRIMITIVES
+from abcd_ns.engine.render.projection import PRIMITIVES
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from abcd_ns.engine.gaussians.param_swap import nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree

@@ -55,9 +55,10 @@ def steps_alone(coordinator, photos, counts: Counts) -> list[Counts]:
 def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, blocks, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
     coordinator = on_device(blocks=blocks, steps=3 * blocks, density=GATHERING, crop_pixels=parts)
-    for taken in steps_alone(coordinator, photos, simulated_gsplat)[
-        1:
-    ]:  # the first one uploads cameras and backgrounds
+    _, *later = steps_alone(
+        coordinator, photos, simulated_gsplat
+    )  # the first uploads cameras and backgrounds
+    for taken in later:
         apart = taken.waits.pop("isect_tiles")
         assert apart == 1
         assert dict(+taken.waits) in ({}, {"event": 1}), taken.places

@@ -1,6 +1,5 @@
 """Fused Adam: the native library's on a CPU, else torch's, whose steps may be counted for several at once."""
 
-import ctypes
 import math
 from typing import Any
 
@@ -29,9 +28,8 @@ class Adam(torch.optim.Adam):
             return
         if self.counts:
             torch._foreach_add_(parts[-1], 1)
-        if suits(*parts[0], *parts[1]) and not (
-            group["weight_decay"] or group["amsgrad"] or group["maximize"]
-        ):
+        is_plain = not (group["weight_decay"] or group["amsgrad"] or group["maximize"])
+        if is_plain and suits(*parts[0], *parts[1]):
             for each in zip(*parts[:4], parts[-1], strict=True):
                 _step_natively(*each, group)
             return
@@ -46,5 +44,4 @@ def _step_natively(
 ) -> None:
     (beta1, beta2), steps = group["betas"], float(count)
     rates = (group["lr"] / (1 - beta1**steps), beta1, beta2, math.sqrt(1 - beta2**steps), group["eps"])
-    pointers = (ctypes.c_void_p(address(each)) for each in (value, grad, first, second))
-    library().abcd_adam(ctypes.c_int64(value.numel()), *pointers, *map(ctypes.c_float, rates))
+    library().abcd_adam(value.numel(), *map(address, (value, grad, first, second)), *rates)

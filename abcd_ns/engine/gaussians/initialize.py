@@ -126,26 +126,14 @@ def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
 
 
 def split_off(points: Points, keep: int, seed: int) -> tuple[Points, Points]:
-    """A random `keep` of the points, widened to fill the gaps, and the others."""
+    """A random `keep` of the points, widened to fill the gaps, and the others; all where there are no more.
+    A seed always makes the same choice."""
     if keep >= len(points):
         return points, points[:0]
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
     chosen, others = points[order[:keep].sort().values], points[order[keep:].sort().values]
     wide = torch.maximum(chosen.scales, spacing(chosen.means).log_()[:, None])
     return replace(chosen, scales=wide), others
-
-
-def thin_out(points: PointCloud, limit: int | None, seed: int) -> PointCloud:
-    """No more points than `limit`: all of them, or a random choice, widened to fill the gaps, so that a scene
-    with fewer Gaussians than points is covered all the same.
-
-    Density control never adds above the limit, but it removes only what is faint or huge.
-
-    Args:
-        limit: None for no limit.
-        seed: the same one makes the same choice.
-    """
-    return points if limit is None else split_off(points, limit, seed)[0]
 
 
 def thin_points(
@@ -187,9 +175,8 @@ def thin_points(
     del column, cells, level
     order, owner = torch.from_numpy(order), torch.from_numpy(begins).cumsum(0) - 1
     number = owner.bincount()
-    return tuple(
-        _means_by_owner(values, order, owner, number).to(points.dtype) for values in (points, colors)
-    )
+    means = (_means_by_owner(values, order, owner, number) for values in (points, colors))
+    return tuple(mean.to(points.dtype) for mean in means)
 
 
 def _means_by_owner(values: Tensor, order: Tensor, owner: Tensor, number: Tensor) -> Float64[Tensor, "m 3"]:
@@ -230,11 +217,6 @@ def _random_quats(count: int, generator: torch.Generator) -> Float[Tensor, "n 4"
     uniform = torch.rand((3, count), generator=generator)
     for found, (u, v, w) in zip(quats.split(CHUNK), uniform.split(CHUNK, dim=1), strict=True):
         a, b = torch.sqrt(1 - u), torch.sqrt(u)
-        parts = (
-            a * torch.sin(tau * v),
-            a * torch.cos(tau * v),
-            b * torch.sin(tau * w),
-            b * torch.cos(tau * w),
-        )
-        torch.stack(parts, dim=1, out=found)
+        v, w = tau * v, tau * w
+        torch.stack((a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()), dim=1, out=found)
     return quats

@@ -80,8 +80,7 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
     persisted is copied once more.
 
     Args:
-        growth: the strategy's statistics, each [n]; copied.
-        clocks: the block's clocks, up to date.
+        growth: density control's statistics, each [n]; copied.
     """
     adam = {name: optimizers[name].state[params[name]] for name in PARAM_NAMES}
     moments = [adam[name][moment] for moment in MOMENTS for name in PARAM_NAMES]

@@ -28,6 +28,23 @@ TUNED = ("-march=native",), ("-mcpu=native",), ()
 """Further flags, the best first; not every compiler knows each for every processor."""
 SECONDS = 300
 """After which a compiler is given up."""
+_POINTER, _INT, _LONG, _FLOAT = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, ctypes.c_float
+ARGUMENTS = {
+    "threads": [_INT],
+    "project": [_INT, *[_POINTER] * 2, _LONG, _POINTER],
+    "project_back": [_INT, *[_POINTER] * 2, _LONG, *[_POINTER] * 2],
+    "lists": [_INT, _POINTER, _LONG, _POINTER, _LONG, _INT],
+    "free": [_POINTER],
+    "draw": [*[_POINTER] * 3, _INT],
+    "draw_back": [_POINTER, _LONG, *[_POINTER] * 5, _LONG],
+    "windows": [_POINTER, _FLOAT, *[_POINTER] * 4],
+    "members": [_POINTER] * 3,
+    "deepen": [_POINTER] * 3,
+    "photometric": [*[_POINTER] * 2, *[_LONG] * 2, *[_POINTER] * 3],
+    "adam": [_LONG, *[_POINTER] * 4, *[_FLOAT] * 5],
+    "worth": [_LONG, *[_POINTER] * 5, _LONG, _FLOAT, _POINTER, *[_LONG] * 2],
+}
+"""Of the library's functions, whose names have `abcd_` before them."""
 
 
 def kernels_folder() -> Path:
@@ -66,7 +83,9 @@ def library() -> ctypes.CDLL | None:
             f"The CPU rasterizer runs in torch, 20 times slower: {_first_line(reason)}", stacklevel=2
         )
         return None
-    found.abcd_lists.restype = ctypes.c_void_p
+    for name, arguments in ARGUMENTS.items():
+        getattr(found, f"abcd_{name}").argtypes = arguments
+    found.abcd_lists.restype = _POINTER
     found.abcd_threads(threads_wanted())
     return found
 
@@ -90,7 +109,7 @@ def suits(*tensors: Tensor) -> bool:
 
 
 def address(tensor: Tensor | None) -> int | None:
-    """Of a contiguous float32 tensor, for a call."""
+    """Of a contiguous tensor, for a call."""
     return None if tensor is None else tensor.data_ptr()
 
 

@@ -1,6 +1,5 @@
 """L1 and SSIM with their gradient, by the native library or in torch."""
 
-import ctypes
 import math
 
 import torch
@@ -32,13 +31,10 @@ def photometric_sums(
         return _in_torch(rendered, photo, weights)
     rendered, photo = rendered.contiguous(), photo.contiguous()
     (height, width, _), gradient = rendered.shape, torch.empty_like(rendered)
-    sums = (ctypes.c_double * 2)()
-    sizes = ctypes.c_int64(height), ctypes.c_int64(width)
-    pointers = (ctypes.c_void_p(address(tensor)) for tensor in (rendered, photo))
-    library().abcd_photometric(
-        *pointers, *sizes, (ctypes.c_float * 2)(*weights), sums, ctypes.c_void_p(address(gradient))
-    )
-    return torch.tensor(list(sums), dtype=torch.float32), gradient
+    sums, by_sum = torch.empty(2, dtype=torch.float64), torch.tensor(weights, dtype=torch.float32)
+    pointers = map(address, (by_sum, sums, gradient))
+    library().abcd_photometric(address(rendered), address(photo), height, width, *pointers)
+    return sums.float(), gradient
 
 
 def _in_torch(rendered: Tensor, photo: Tensor, weights: tuple[float, float]) -> tuple[Tensor, Tensor]:

@@ -30,11 +30,7 @@ def over(front: Layer, behind: Layer) -> Layer:
 
 
 def fold(layers: Sequence[Layer], like: Layer | None = None) -> Layer:
-    """All layers, given front to back, collapsed into one.
-
-    Args:
-        like: gives size, dtype and device of the empty layer that no layers at all fold to.
-    """
+    """All layers, given front to back, collapsed into one; none at all into an empty one like `like`."""
     if layers:
         return reduce(over, layers)
     return empty_layer(*like.transmittance.shape, like.color.device, like.color.dtype)

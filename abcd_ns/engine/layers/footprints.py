@@ -9,9 +9,8 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.render import Rasterizer
-from abcd_ns.engine.space.culling import CROP_ALIGN
 from abcd_ns.engine.space.influence import COARSE_SIDE, coarser, in_passes
-from abcd_ns.engine.space.visibility import footprint
+from abcd_ns.engine.space.visibility import CROP_ALIGN, footprint
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
 

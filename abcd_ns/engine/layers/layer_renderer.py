@@ -17,10 +17,9 @@ from cachetools import LRUCache, cached
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.space.culling import Frusta, Optics, shared
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
-from abcd_ns.engine.space.visibility import reaches, straddles
+from abcd_ns.engine.space.visibility import Frusta, Optics, reaches, shared, straddles
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
@@ -107,7 +106,6 @@ class LayerRenderer:
     """Draws the frozen blocks of a scene.
 
     Args:
-        scene: where Gaussians are read from.
         pass_gaussians: the most Gaussians that one drawing may take on the device. A node of the tree
             that holds more is drawn in parts, down to single blocks.
     """
@@ -233,9 +231,8 @@ class LayerRenderer:
 
     def raster(self, node: int, gaussians: Gaussians, view: View, settings: RenderSettings) -> Raster:
         """All that a view sees of a node, by fragments what lies within it; differentiable."""
-        window = None
-        if self.ownership == "fragments" and node:
-            window = self.span(node, view, view.full)
+        is_cut = node and self.ownership == "fragments"
+        window = self.span(node, view, view.full) if is_cut else None
         return self.rasterizer.draw(gaussians, [Shot(view, view.full, None, window)], **vars(settings))[0]
 
     @torch.no_grad()
@@ -287,15 +284,22 @@ class LayerRenderer:
         Args:
             stop: transmittance below which nothing behind is drawn, if no pixel has more.
         """
-        whole, nodes = self.nothing(view), self.nodes()
-        shown = self.shown(nodes, [(view, view.full)])
-        for node in self.order(nodes, view):
+        whole = self.nothing(view)
+        for node, gaussians in self.loaded_in_order(view):
+            whole = drawn_over(whole, self.raster(node, gaussians, view, settings))
             if float(whole.transmittance.max()) < stop:
                 break
+        return whole
+
+    def loaded_in_order(self, view: View) -> Iterator[tuple[int, Gaussians]]:
+        """Nodes front to back, each with its Gaussians that `view` may see, if there are any; loaded as they
+        are asked for."""
+        nodes = self.nodes()
+        shown = self.shown(nodes, [(view, view.full)])
+        for node in self.order(nodes, view):
             gaussians = self.load(shown[node]).gaussians
             if len(gaussians):
-                whole = drawn_over(whole, self.raster(node, gaussians, view, settings))
-        return whole
+                yield node, gaussians
 
     def nothing(self, view: View) -> Raster:
         """A drawing of no Gaussians."""
@@ -330,12 +334,8 @@ def _over(front: FrozenLayers, behind: FrozenLayers) -> FrozenLayers:
     inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
     crop = front.crop.joined(behind.crop)
     front, behind = _widened(front, crop), _widened(behind, crop)
-    return FrozenLayers(
-        over(front.front, behind.front),
-        over(front.back, behind.back),
-        Splats(torch.cat(inside, dim=1)) if inside else None,
-        crop,
-    )
+    splats = Splats(torch.cat(inside, dim=1)) if inside else None
+    return FrozenLayers(over(front.front, behind.front), over(front.back, behind.back), splats, crop)
 
 
 def _widened(part: FrozenLayers, crop: Crop) -> FrozenLayers:

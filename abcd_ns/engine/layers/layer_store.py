@@ -69,14 +69,14 @@ class LayerStore:
     """What a visit keeps, by view, under limits of bytes. What has no room is not kept.
 
     Args:
-        device: where layers are used.
-        device_bytes: limit there.
+        device_bytes: limit on the device, where layers are used.
         ram_bytes: limit in RAM, for what has no room on the device; unused where the device is the CPU.
     """
 
     def __init__(self, device: torch.device, device_bytes: int, ram_bytes: int = 0) -> None:
         self._device = device
-        self._device_room = device_bytes
+        self.free = device_bytes
+        """Bytes that are left on the device."""
         self._ram_room = 0 if device.type == "cpu" else ram_bytes
         self._kept: dict[int, Kept] = {}
 
@@ -85,15 +85,10 @@ class LayerStore:
         """Of all that is kept, wherever it is."""
         return sum(kept.nbytes for kept in self._kept.values())
 
-    @property
-    def free(self) -> int:
-        """Bytes that are left on the device."""
-        return self._device_room
-
     def put(self, view: int, kept: Kept) -> None:
         """Keep what was drawn for a view, which has nothing here yet, if there is room."""
-        if kept.nbytes <= self._device_room:
-            self._device_room -= kept.nbytes
+        if kept.nbytes <= self.free:
+            self.free -= kept.nbytes
         elif (needed := self._in_ram(kept)) <= self._ram_room:
             self._ram_room -= needed
             kept = kept.moved(_to_ram)

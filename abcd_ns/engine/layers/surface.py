@@ -15,6 +15,7 @@ from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.splat_kernels import own_axes
 from abcd_ns.engine.types import Gaussians, View
 
 UPRIGHT = 2
@@ -24,19 +25,10 @@ NEARER = 0.85
 
 
 def normals_of(gaussians: Gaussians, center: Float[Tensor, "3"], flat: bool) -> Float[Tensor, "n 3"]:
-    """Unit vectors across Gaussians, world space, on the side of a camera's centre.
-
-    Args:
-        flat: whether they are surfels.
-    """
-    w, x, y, z = F.normalize(gaussians.quats, dim=1).unbind(1)
-    # The rotations' columns, as rows.
-    rows = (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        *(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        *(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack(rows, dim=1).view(-1, 3, 3)
+    """Unit vectors across Gaussians, or across surfels if `flat`; world space, on the side of a camera's
+    centre."""
+    found = own_axes(*F.normalize(gaussians.quats, dim=1).unbind(1))
+    axes = torch.stack([torch.stack(axis, dim=1) for axis in found], dim=1)
     which = gaussians.scales.argmin(dim=1)
     which = torch.full_like(which, UPRIGHT) if flat else which
     normals = axes[torch.arange(len(which), device=which.device), which]
@@ -45,12 +37,8 @@ def normals_of(gaussians: Gaussians, center: Float[Tensor, "3"], flat: bool) -> 
 
 
 def colored_by_normal(gaussians: Gaussians, view: View, flat: bool) -> Gaussians:
-    """The same in the colours (n + 1) / 2: of their pictures, which any rasterizer draws and any layers fold
-    to, `normals_in` makes normals. To be drawn with harmonics of degree 0.
-
-    Args:
-        view: that they are to face.
-    """
+    """The same in the colours (n + 1) / 2, for normals that face the view. Any rasterizer draws them, with
+    harmonics of degree 0, and any layers fold; `normals_in` makes normals of the picture."""
     shown = normals_of(gaussians, view.center, flat) / (2 * SH_C0)
     return replace(gaussians, features_dc=shown, features_rest=torch.zeros_like(gaussians.features_rest))
 
@@ -90,15 +78,10 @@ def median_depth(renderer: LayerRenderer, view: View, settings: RenderSettings) 
     like = {"device": renderer.device, "dtype": view.viewmat.dtype}
     left = torch.ones((view.height, view.width), **like)
     depth = torch.zeros_like(left)
-    nodes = renderer.nodes()
-    shown = renderer.shown(nodes, [(view, view.full)])
-    for node in renderer.order(nodes, view):
+    for node, gaussians in renderer.loaded_in_order(view):
+        window = renderer.span(node, view, view.full) if node else None
+        given = gaussians, view, window, (left, depth)
+        left, depth = rasterizer.deepened(*given, antialiased=settings.antialiased)
         if float(left.max()) <= 0.5:
             break
-        gaussians = renderer.load(shown[node]).gaussians
-        window = renderer.span(node, view, view.full) if node else None
-        if len(gaussians):
-            left, depth = rasterizer.deepened(
-                gaussians, view, window, (left, depth), antialiased=settings.antialiased
-            )
     return depth

@@ -18,7 +18,7 @@ from abcd_ns.engine.layers.layer_renderer import (
 )
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.render import ZWindow
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 
@@ -27,10 +27,7 @@ class VisitLayers:
 
     Args:
         store: where they are kept; new for each visit.
-        own: the block's Gaussians when the visit began; they decide the windows.
-        window_weight: see Recipe.
-        views: all views, by index.
-        visible: see LayerRenderer.
+        own: the block's Gaussians when the visit began; they decide the windows, with Recipe.window_weight.
         parts_bytes: size of the layers held while nodes are folded, beside what is free in the store.
         backwards: load nodes in the opposite order. Where visits alternate, what the one before read last is
             still in RAM.
@@ -152,12 +149,9 @@ class VisitLayers:
         if self._own is None:
             return
         new = [view for view in views if view not in self._windows]
-        found = self._renderer.rasterizer.depth_windows(
-            self._own.to(self._renderer.device),
-            [(self._views[view], self._geometry.crops[view]) for view in new],
-            visible=self._window_weight,
-            antialiased=self._settings.antialiased,
-        )
+        seen = [(self._views[view], self._geometry.crops[view]) for view in new]
+        own, options = self._own.to(self._renderer.device), {"antialiased": self._settings.antialiased}
+        found = self._renderer.rasterizer.depth_windows(own, seen, visible=self._window_weight, **options)
         self._windows.update(zip(new, found, strict=True))
 
     def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:

@@ -6,7 +6,7 @@ import torch
 
 from abcd_ns.engine.render.base import CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.primitive import PrimitiveName
+from abcd_ns.engine.render.projection import PrimitiveName
 from abcd_ns.engine.render.self_check import self_check
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.errors import UserError
@@ -28,17 +28,11 @@ WITHOUT_GSPLAT = ("cpu", "mps")
 
 
 def make_rasterizer(
-    name: Literal["auto", "torch", "gsplat"],
-    device: torch.device | str,
-    *,
-    primitive: PrimitiveName = "3dgs",
+    name: Literal["auto", "torch", "gsplat"], device: torch.device | str, *, primitive: PrimitiveName = "3dgs"
 ) -> Rasterizer:
     """The rasterizer called `name`; "auto" takes gsplat where there may be kernels for it, else torch.
 
     gsplat's kernels are checked against the torch backend on a tiny scene first (see self_check).
-
-    Args:
-        primitive: what a Gaussian is.
 
     Raises:
         ValueError: gsplat was asked for on such a device.

@@ -9,10 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.render.primitive import Primitive
-from abcd_ns.engine.render.projection import Splats, extents_of
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.projection import Primitive, Splats, extents_of
+from abcd_ns.engine.render.z_window import TileGrid, ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 

@@ -62,11 +62,12 @@ def photometric_loss(
     height, width = rendered.shape[:2]
     by_pixel = (1 - ssim_lambda) / (3 * full_pixels)
     has_windows = ssim_lambda > 0 and full_windows > 0 and min(height, width) >= SSIM_WINDOW
-    if not has_windows:
-        return by_pixel * _by_pixels(rendered, photo, pixel_loss)
-    in_kernel = by_pixel if pixel_loss == "l1" else 0.0
-    loss = _Photometric.apply(rendered, photo, in_kernel, ssim_lambda / (3 * full_windows))
-    return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
+    by_window = ssim_lambda / (3 * full_windows) if has_windows else 0.0
+    if has_windows and pixel_loss == "l1":
+        return _Photometric.apply(rendered, photo, by_pixel, by_window)
+    difference = rendered - photo
+    loss = by_pixel * (difference.abs() if pixel_loss == "l1" else difference.square()).sum()
+    return loss + _Photometric.apply(rendered, photo, 0.0, by_window) if has_windows else loss
 
 
 def warm_up(device: torch.device | str) -> None:
@@ -75,13 +76,6 @@ def warm_up(device: torch.device | str) -> None:
         picture = torch.zeros(2 * SSIM_WINDOW, 3 * SSIM_WINDOW, 3, device=device, requires_grad=True)
         options = {"full_pixels": 6 * SSIM_WINDOW**2, "full_windows": ssim_windows(*picture.shape[:2])}
         photometric_loss(picture, torch.ones_like(picture), **options).backward()
-
-
-def _by_pixels(
-    rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], pixel_loss: Literal["l1", "l2"]
-) -> Float[Tensor, ""]:
-    difference = rendered - photo
-    return difference.abs().sum() if pixel_loss == "l1" else difference.square().sum()
 
 
 def ssim_windows(height: int, width: int) -> int:

@@ -1,8 +1,9 @@
-"""Gaussians as one camera sees them."""
+"""Gaussians as one camera sees them: 3DGS's ellipsoids or 2DGS's discs, with the same parameters."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -10,9 +11,62 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
-from abcd_ns.engine.render.primitive import SPLATS, Primitive
+from abcd_ns.engine.render import splat_kernels, surfel_kernels
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.types import Gaussians, View
+
+PrimitiveName = Literal["3dgs", "2dgs"]
+DRAWN_SIGMAS = 3.33
+"""How far out a Gaussian is drawn, in standard deviations on screen. Fragments under alpha = 1/255 are
+skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255) = 3.3291."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """How Gaussians are projected, and which tiles may draw them.
+
+    What they look like in a pixel is in `cpu/reference.py`, and in `cuda/kinds.py`.
+    """
+
+    name: PrimitiveName
+    prefix: str
+    """Of names that tell primitives apart."""
+    project: Callable[[Tensor, Tensor], Tensor]
+    """Parameters [p, n] and a camera [c] to rows [r, n], in torch; see Splats."""
+    graded: int
+    """Rows that take gradients: all but the last four."""
+    center: int
+    """The first of two such rows that say where on screen the middle is; residuals are summed about it."""
+    axes: int
+    """Along which it extends: those of its scales that are drawn."""
+    blur_pixels: float
+    """How far from its middle a point may be drawn, px."""
+
+    @property
+    def rows(self) -> int:
+        """Of a Gaussian in one view, see Splats."""
+        return self.graded + 4
+
+
+SPLATS = Primitive(
+    name="3dgs",
+    prefix="",
+    project=splat_kernels.splat,
+    graded=splat_kernels.GRADED,
+    center=splat_kernels.X,
+    axes=3,
+    blur_pixels=DRAWN_SIGMAS * math.sqrt(splat_kernels.EPS_2D),
+)
+SURFELS = Primitive(
+    name="2dgs",
+    prefix="surfel-",
+    project=surfel_kernels.surfel,
+    graded=surfel_kernels.GRADED,
+    center=surfel_kernels.U,
+    axes=2,
+    blur_pixels=DRAWN_SIGMAS * math.sqrt(0.5),
+)
+PRIMITIVES: dict[PrimitiveName, Primitive] = {each.name: each for each in (SPLATS, SURFELS)}
 
 
 @dataclass(frozen=True)
@@ -71,11 +125,7 @@ class Splats:
 def project_in_torch(
     gaussians: Gaussians, cameras: Sequence[Float[Tensor, "c"]], primitive: Primitive = SPLATS
 ) -> Float[Tensor, "v r n"]:
-    """Planes of each camera, see Splats; differentiable in the Gaussians and in the cameras.
-
-    Args:
-        cameras: see `camera_numbers`.
-    """
+    """Planes of each camera, see Splats and `camera_numbers`; differentiable in the Gaussians and cameras."""
     parts = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.features_dc]
     rest = gaussians.features_rest.flatten(1)
     parameters = torch.cat((*parts, F.pad(rest, (0, 3 * BASES - rest.shape[1]))), dim=1).T
@@ -111,7 +161,6 @@ def extents_of(
     Args:
         means2d: centres in the full image, px.
         radii: half the sides of their squares, px; 0 where culled.
-        view: gives the size of the image.
     """
     low, high = means2d - radii[..., None], means2d + radii[..., None]
     visible = (radii > 0) & (high > 0).all(dim=-1)

@@ -87,7 +87,7 @@ def rasterization(
     cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
-    rasters = _draw(gaussians, views, absgrad, **options)
+    rasters = _draw(gaussians, views, **options, **({"absgrad": True} if absgrad else {}))
     color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]
@@ -98,13 +98,11 @@ def rasterization(
     return torch.cat(wanted, dim=-1), alphas, rasters[0].info | sizes
 
 
-def _draw(gaussians: Gaussians, views: Sequence[View], absgrad: bool, **options: Any) -> tuple[Raster, ...]:
-    rasterizer, shots = rasterizer_on(gaussians.means.device), [Shot(view, view.full) for view in views]
-    if not absgrad:
-        return rasterizer.draw(gaussians, shots, **options)
-    if not isinstance(rasterizer, TorchRasterizer):
+def _draw(gaussians: Gaussians, views: Sequence[View], **options: Any) -> tuple[Raster, ...]:
+    rasterizer = rasterizer_on(gaussians.means.device)
+    if "absgrad" in options and not isinstance(rasterizer, TorchRasterizer):
         raise ValueError(NO_ABSGRAD)
-    return rasterizer.draw(gaussians, shots, absgrad=True, **options)
+    return rasterizer.draw(gaussians, [Shot(view, view.full) for view in views], **options)
 
 
 def _channels(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:

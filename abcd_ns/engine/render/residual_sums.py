@@ -1,7 +1,6 @@
 """What a drawing's residual says of each Gaussian: sums over pixels, by which growth decides."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -13,38 +12,30 @@ SUMS = 10
 """Of a Gaussian in a picture."""
 
 
-@runtime_checkable
-class ResidualSums(Protocol):
+class ResidualSums:
     """For each Gaussian of a drawing the sums over pixels of w f, w r, w r x and w r y.
 
     There w = alpha T is its weight, r the residual by channel, f how much the pixel counts, and (x, y) the
     pixel's middle less the Gaussian's, px.
-    """
-
-    values: Float[Tensor, "v n 10"] | None
-    """After the drawing's backward pass; None where nobody has asked."""
-
-    def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
-        """Call before the backward pass.
-
-        Args:
-            residuals: of each picture r, then f.
-        """
-        ...
-
-
-class SumsApart:
-    """Sums that are found at once, apart from the drawing's gradients.
 
     Args:
-        find: the values for residuals.
+        find: values for residuals, apart from the drawing's gradients; None where its backward pass finds
+            both at once.
     """
 
-    def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]]) -> None:
-        self.values, self._find = None, find  # which holds on to all that was drawn
+    def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]] | None = None) -> None:
+        self.values: Float[Tensor, "v n 10"] | None = None
+        """After the drawing's backward pass; None where nobody has asked."""
+        self.asked: list[Tensor] | None = None
+        """The residuals that the backward pass is to sum up."""
+        self._find = find  # which holds on to all that was drawn
 
     def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
-        self.values, self._find = self._find(residuals), None
+        """Call before the backward pass, with r and then f of each picture."""
+        if self._find is None:
+            self.asked = [residual.contiguous() for residual in residuals]
+        else:
+            self.values, self._find = self._find(residuals), None
 
 
 def moments(residual: Float[Tensor, "h w 4"], crop: Crop) -> Float[Tensor, "h w 10"]:

@@ -3,15 +3,13 @@
 The reference of kernels/cpp/projection.h.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.spherical_harmonics import (
-    SH_C0,
-    sh_basis_rows,
-    sh_degree_of,
-)
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, sh_degree_of
 
 FAR_PLANE = 1e10
 """Gaussians with a larger camera z are not drawn; world units."""
@@ -96,15 +94,18 @@ def camera_axes(
     """The Gaussian's three axes, one standard deviation long, in camera space: [component][axis]."""
     w, x, y, z = quaternion
     per_length = torch.rsqrt((w * w + x * x + y * y + z * z).clamp_min(TINY))
-    w, x, y, z = w * per_length, x * per_length, y * per_length, z * per_length
-    turned = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    columns = [[row[k] for row in turned] for k in range(3)]
+    columns = own_axes(w * per_length, x * per_length, y * per_length, z * per_length)
     return [
         [dot(rotation[3 * i : 3 * i + 3], columns[k]) * deviations[k] for k in range(3)] for i in range(3)
+    ]
+
+
+def own_axes(w: Tensor, x: Tensor, y: Tensor, z: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """The columns of the rotation that a unit quaternion is."""
+    return [
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
     ]
 
 
@@ -124,7 +125,7 @@ def sh_color(parameters: Float[Tensor, "p n"], number: tuple[Tensor, ...]) -> li
     return [(value + 0.5).clamp_min(0.0) for value in sums]
 
 
-def dot(a: list[Tensor] | tuple[Tensor, ...], b: list[Tensor]) -> Tensor:
+def dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
     """Of two vectors of rows."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

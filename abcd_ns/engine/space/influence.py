@@ -41,18 +41,13 @@ Influence = dict[int, dict[int, float]]
 
 
 def weights(
-    gaussians: Gaussians,
-    rasterizer: Rasterizer,
-    shots: Sequence[Shot],
-    *,
-    antialiased: bool = False,
+    gaussians: Gaussians, rasterizer: Rasterizer, shots: Sequence[Shot], *, antialiased: bool = False
 ) -> Float[Tensor, "v n"]:
     """For each shot the sum of each Gaussian's weights over its pixels."""
     if not len(gaussians):
         return gaussians.means.new_zeros(len(shots), 0)
-    rasters = rasterizer.draw(
-        gaussians.detach(), shots, sh_degree=0, antialiased=antialiased, blend_weights=True
-    )
+    options = {"sh_degree": 0, "antialiased": antialiased, "blend_weights": True}
+    rasters = rasterizer.draw(gaussians.detach(), shots, **options)
     leaves = {id(raster.info): raster.info["weights"] for raster in rasters}
     found = torch.autograd.grad(sum(raster.depth.sum() for raster in rasters), list(leaves.values()))
     # Shots that share an info are its cameras, in their order.
@@ -80,11 +75,8 @@ def share_shown(
     *,
     antialiased: bool = False,
 ) -> float:
-    """The influence of some Gaussians on the view of a shot that shows all of them.
-
-    Args:
-        front: transmittance of what lies before everything; None for nothing.
-    """
+    """The influence of some Gaussians on the view of a shot that shows all of them, behind something of the
+    transmittance `front`; None for nothing."""
     found = weights_by_pixel(gaussians, rasterizer, shot, antialiased=antialiased)
     shown = found if front is None else found * front
     return round(float(shown.sum()) / shot.view.full.pixels, DIGITS)
@@ -98,11 +90,8 @@ def influence(
     *,
     antialiased: bool = False,
 ) -> Influence:
-    """The influence of every block on every view, from Gaussians that stand for the whole scene.
-
-    Args:
-        owner: each Gaussian's block.
-    """
+    """The influence of every block on every view, from Gaussians that stand for the whole scene and their
+    blocks."""
     blocks = int(owner.max()) + 1 if len(owner) else 0
     found: Influence = {}
     small = [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in views]
@@ -124,11 +113,8 @@ def in_passes(gaussians: Gaussians, small: Sequence[View]) -> Iterator[list[Shot
 
 class InfluenceTable:
     """The influence of every block on the views that were drawn to train the whole scene, as it was when each
-    was last drawn: the drawings know it. On the device; nothing waits for it until it is asked for.
-
-    Args:
-        known: to begin with.
-    """
+    was last drawn: the drawings know it. On the device; nothing waits for it until it is asked for. What is
+    `known` is there to begin with."""
 
     def __init__(
         self, tree: BlockTree, views: Iterable[int], known: Influence, device: torch.device | str
@@ -159,10 +145,10 @@ class InfluenceTable:
         influence: Influence = {}
         unknown = set[int]()
         for view, row in zip(self._row, self._table.tolist(), strict=True):
-            if not all(map(math.isfinite, row)):
+            if all(map(math.isfinite, row)):
+                _put(influence, view, row)
+            else:
                 unknown.add(view)
-                continue
-            _put(influence, view, row)
         return influence, unknown
 
 
@@ -205,11 +191,8 @@ def visible_blocks(influence: Influence, views: Iterable[int], blocks: int) -> d
 
 
 def worth_training(views: Mapping[int, float], share: float) -> tuple[int, ...]:
-    """The fewest views that hold at least `share` of a block's influence, by increasing index.
-
-    Args:
-        views: the block's influence on each view.
-    """
+    """The fewest of the views, given with a block's influence on each, that hold at least `share` of it; by
+    increasing index."""
     ranked = sorted(views, key=lambda view: (-views[view], view))
     wanted, held = share * sum(views.values()), 0.0
     for count, view in enumerate(ranked):

@@ -20,7 +20,7 @@ interval holds z, and along z the cells follow one another in front_to_back orde
 
 One ray serves all pixels of a tile: what is drawn in the tile is then parted by z alike for each of them, and
 that is all that folding needs. A fragment may so be given to a cell that its own ray misses, by half a tile's
-diagonal at most; tests of reach allow for that (see culling.py).
+diagonal at most; tests of reach allow for that (see visibility.py).
 """
 
 import math
@@ -29,8 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.z_window import TileGrid, ZWindow
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import View
 
@@ -59,9 +58,8 @@ def ray_interval(box: Box, view: View, grid: TileGrid, device: torch.device | st
     directions = ray_directions(view, grid, device)
     near = torch.full_like(directions[0], -math.inf)
     far = torch.full_like(directions[0], math.inf)
-    for direction, c, lower, upper in zip(
-        directions, view.center.tolist(), box.lower.tolist(), box.upper.tolist(), strict=True
-    ):
+    numbers = (view.center.tolist(), box.lower.tolist(), box.upper.tolist())
+    for direction, c, lower, upper in zip(directions, *numbers, strict=True):
         for plane, box_is_right in ((lower, True), (upper, False)):
             if math.isinf(plane):
                 continue

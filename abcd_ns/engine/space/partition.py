@@ -57,12 +57,8 @@ def build_kd(points: Float[Tensor, "n 3"], num_blocks: int) -> BlockTree:
 
 
 def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> BlockTree:
-    """A regular grid, as nested splits, over where the points are (outliers aside).
-
-    The outermost cells reach to infinity.
-
-    Args:
-        counts: the cells on each axis.
+    """A regular grid of so many cells on each axis, as nested splits, over where the points are (outliers
+    aside). The outermost cells reach to infinity.
 
     Raises:
         ValueError: `counts` are not positive, over MAX_BLOCKS in all, or a point is not finite.

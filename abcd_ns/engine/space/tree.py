@@ -5,14 +5,24 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
+import msgspec
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from abcd_ns.engine.types import CHUNK
 
-FORMAT = "abcd_ns.block_tree/1"
+_Index = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 31)]
+
+
+class _Stored(msgspec.Struct):
+    """A tree as JSON has it."""
+
+    format: Literal["abcd_ns.block_tree/1"]
+    nodes: list[tuple[_Index, float, _Index, _Index, _Index]]
+    """(axis, threshold, left, right, block) of each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +75,8 @@ class BlockTree:
 
     def __post_init__(self) -> None:
         if not _is_tree(self):
-            raise ValueError(
-                "block tree: not a binary tree, parents first, with blocks 0 to K - 1 at its leaves"
-            )
+            wanted = "a binary tree, parents first, with blocks 0 to K - 1 at its leaves"
+            raise ValueError(f"block tree: not {wanted}")
         lower, upper = self._bounds
         node = (self.axis >= 0).nonzero()[:, 0]
         axis, threshold = self.axis[node], self.threshold[node]
@@ -168,7 +177,7 @@ class BlockTree:
     def to_json(self) -> str:
         """As text that from_json turns back into the same tree, bit for bit."""
         # json writes a float as repr does: the shortest text that reads back as the same float64.
-        return json.dumps({"format": FORMAT, "nodes": self.rows})
+        return json.dumps({"format": "abcd_ns.block_tree/1", "nodes": self.rows})
 
     @staticmethod
     def from_json(text: str) -> "BlockTree":
@@ -178,15 +187,9 @@ class BlockTree:
             ValueError: the text is not JSON, not of this format, or describes no tree.
         """
         try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"block tree: not valid JSON ({error})") from error
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ValueError(f'block tree: expected a JSON object with "format": "{FORMAT}"')
-        rows = data.get("nodes")
-        if not isinstance(rows, list) or not all(_is_row(row) for row in rows):
-            raise ValueError('block tree: "nodes" must list [axis, threshold, left, right, block] of each')
-        return tree_from_rows(rows)
+            return tree_from_rows(msgspec.json.decode(text, type=_Stored).nodes)
+        except msgspec.MsgspecError as error:
+            raise ValueError(f"block tree: {error}") from error
 
 
 def node_children_in_order(tree: BlockTree, node: int, center: Sequence[float]) -> tuple[int, int]:
@@ -226,13 +229,6 @@ def tree_from_rows(rows: Sequence[Sequence[int | float]]) -> BlockTree:
     """A tree from (axis, threshold, left, right, block) of each node."""
     axis, threshold, *rest = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(dim=1)
     return BlockTree(axis.long(), threshold.clone(), *(column.long() for column in rest))
-
-
-def _is_row(row: object) -> bool:
-    """Whether `row` may be a node in JSON. The bound keeps out integers that no tensor could hold."""
-    if not isinstance(row, list) or [type(value) for value in row] != [int, float, int, int, int]:
-        return False
-    return all(abs(value) < 2**31 for value in row if isinstance(value, int))
 
 
 def _is_tree(tree: BlockTree) -> bool:

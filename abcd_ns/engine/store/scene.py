@@ -16,8 +16,8 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
-from abcd_ns.engine.space.culling import bounds_of, united
 from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.space.visibility import bounds_of, united
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.coarse_model import split_by_block

@@ -5,7 +5,7 @@ from operator import attrgetter
 from typing import Literal
 
 from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
-from abcd_ns.engine.render.primitive import PrimitiveName
+from abcd_ns.engine.render.projection import PrimitiveName
 from abcd_ns.engine.train.capture.light import Kind as LightKind
 from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
-from abcd_ns.engine.space.culling import ROUNDING, Frusta, Optics
 from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
 from abcd_ns.engine.space.tree import in_float64
+from abcd_ns.engine.space.visibility import ROUNDING, Frusta, Optics
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth

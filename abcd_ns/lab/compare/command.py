@@ -96,14 +96,7 @@ class Options:
 
 
 DEFAULTS = Options(
-    methods=METHODS[:3],
-    seeds=(0,),
-    downscale=1,
-    blocks=(8,),
-    vary=(),
-    hold_out="auto",
-    evals=8,
-    pictures=3,
+    methods=METHODS[:3], seeds=(0,), downscale=1, blocks=(8,), vary=(), hold_out="auto", evals=8, pictures=3
 )
 TERRAIN_DEFAULTS = Options(methods=("abcd",), seeds=(0,), tile_gaussians=20_000, visits=3)
 TERRAIN_OPTIONS = {*TERRAIN_DEFAULTS.given, "tiles", "out"}

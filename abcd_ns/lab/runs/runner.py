@@ -25,13 +25,7 @@ from abcd_ns.lab.results.records import RecordError, decode, encode, read_json, 
 from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.results.tables import TABLE_FILE, findings_of, write_table
-from abcd_ns.machine import (
-    Machine,
-    describe_machine,
-    describe_versions,
-    peak_device_bytes,
-    peak_rss_bytes,
-)
+from abcd_ns.machine import Machine, describe_machine, describe_versions, peak_device_bytes, peak_rss_bytes
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
 OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.types import Crop, View
 
@@ -159,11 +159,7 @@ def look_at(eye: Tensor, target: Tensor) -> Float[Tensor, "4 4"]:
 
 
 def camera(
-    eye: Sequence[float],
-    target: Sequence[float],
-    index: int,
-    size: tuple[int, int],
-    focal: float = 1.0,
+    eye: Sequence[float], target: Sequence[float], index: int, size: tuple[int, int], focal: float = 1.0
 ) -> View:
     """A camera at `eye` that looks at `target`; `focal` is its focal length in widths of the picture."""
     (width, height), f = size, focal * size[0]

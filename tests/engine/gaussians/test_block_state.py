@@ -50,9 +50,8 @@ def take_steps(params, optimizers, count: int) -> None:
 def test_rows_that_part_and_join_again_lose_nothing():
     state = some_state(10)
     mask = torch.arange(10) % 3 == 0
-    assert_same(
-        join([state[mask], state[~mask]]), state[torch.cat([torch.where(mask)[0], torch.where(~mask)[0]])]
-    )
+    rows = torch.cat([torch.where(mask)[0], torch.where(~mask)[0]])
+    assert_same(join([state[mask], state[~mask]]), state[rows])
 
 
 def test_a_statistic_that_one_side_lacks_starts_at_zero():

@@ -8,14 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import (
-    Pace,
-    adam_step,
-    attach,
-    detach,
-    nothing_active,
-)
+from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
+from abcd_ns.engine.gaussians.param_swap import Pace, adam_step, attach, detach, nothing_active
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
 
@@ -24,10 +18,7 @@ def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
     params, adam = nothing_active(sh_degree=1)
     attach(BlockState.fresh(random_gaussians(1)), params, adam)
-    pace, before = (
-        Pace(adam, fast_start=False),
-        {name: params[name].detach().clone() for name in PARAM_NAMES},
-    )
+    pace, before = Pace(adam, fast_start=False), {name: params[name].detach().clone() for name in PARAM_NAMES}
     for _ in range(steps):
         pace.set(views, 0, means_decay=1.0)
         for name in PARAM_NAMES:
@@ -56,11 +47,8 @@ def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
 def corrected_moments(adam, parameter) -> tuple[float, float]:
     """Adam's estimates of the gradient and its square, bias-corrected as torch's Adam does."""
     state, (first, second) = adam.state[parameter], adam.param_groups[0]["betas"]
-    step = float(state["step"])
-    return (
-        float(state["exp_avg"].mean()) / (1 - first**step),
-        float(state["exp_avg_sq"].mean()) / (1 - second**step),
-    )
+    step, moments = float(state["step"]), [float(state[name].mean()) for name in MOMENTS]
+    return moments[0] / (1 - first**step), moments[1] / (1 - second**step)
 
 
 def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:

@@ -13,7 +13,7 @@ from abcd_ns.engine.kernels import find_compiler, library, native
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss
-from abcd_ns.engine.render.primitive import PRIMITIVES
+from abcd_ns.engine.render.projection import PRIMITIVES
 from abcd_ns.engine.types import Crop
 from abcd_ns.machine import threads_wanted
 from tests.reference.rasterizer_scenes import (

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
 from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
@@ -43,7 +43,7 @@ def window_for(grid: TileGrid, seed: int = 3) -> ZWindow:
 def by_pixel(window: ZWindow) -> torch.Tensor:
     """(near, far) of each pixel, [2, h, w]."""
     planes = torch.stack((window.near, window.far))[..., None]
-    return window.grid.to_image(planes.expand(-1, -1, window.grid.pixels_per_tile))
+    return window.grid.to_image(planes.expand(-1, -1, window.grid.side**2))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from abcd_ns.engine.render import CutShot, Rasterizer, Shot, TorchRasterizer, ZW
 from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.render.cuda.pairs import TILE
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.rasterizer_scenes import (
@@ -118,13 +118,8 @@ def moved(view: View, by: float = 0.0, **changes) -> View:
 
 def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
     """Of different sizes and near planes, with crops anywhere; some with frozen splats, none, or without."""
-    views = [
-        VIEW,
-        moved(VIEW, 0.2),
-        moved(VIEW, -0.3),
-        moved(VIEW, 0.1, width=64),
-        moved(VIEW, 0.3, near=2.5),
-    ]
+    views = [VIEW, moved(VIEW, 0.2), moved(VIEW, -0.3)]
+    views += [moved(VIEW, 0.1, width=64), moved(VIEW, 0.3, near=2.5)]
     crops = [Crop(19, 5, 30, 31), Crop(0, 0, 17, 40), Crop(53, 16, 17, 29), Crop(32, 32, 32, 13), VIEW.full]
     shots = []
     for k, (view, crop) in enumerate(zip(views, crops, strict=True)):

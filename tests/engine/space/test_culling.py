@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.space.culling import BOUNDS_SLANT, ROUNDING, Frusta, Optics, bounds_of
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import EVERYWHERE, Box
+from abcd_ns.engine.space.visibility import BOUNDS_SLANT, ROUNDING, Frusta, Optics, bounds_of
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -70,27 +70,18 @@ def test_frusta_hold_what_their_cameras_see(seed, spread):
 
 def test_most_of_what_is_beside_and_behind_is_passed_over():
     (view,) = ring_of_views(1, dtype=torch.float64)
-    forward = view.viewmat[2, :3]
-    right = view.viewmat[0, :3]
-    boxes = [
-        Box(center - 0.1, center + 0.1)
-        for center in (
-            view.center + 2 * forward,
-            view.center - 2 * forward,
-            view.center + 20 * right + forward,
-        )
-    ]
-    assert Frusta([(view, view.full)], DRAW.slack).may_show(corners(*boxes))[:, 0].tolist() == [
-        True,
-        False,
-        False,
-    ]
+    right, _, forward = view.viewmat[:3, :3]
+    centers = [view.center + away for away in (2 * forward, -2 * forward, 20 * right + forward)]
+    boxes = corners(*(Box(center - 0.1, center + 0.1) for center in centers))
+    shows = Frusta([(view, view.full)], DRAW.slack).may_show(boxes)
+    assert shows[:, 0].tolist() == [True, False, False]
 
 
 def test_a_box_without_end_may_always_show():
     (view,) = ring_of_views(1)
-    assert Frusta([(view, view.full)], DRAW.slack).may_show(corners(EVERYWHERE)).tolist() == [[True]]
-    assert Frusta([(view, view.full)], DRAW.slack).may_show(torch.zeros(0, 2, 3).double()).shape == (0, 1)
+    frusta = Frusta([(view, view.full)], DRAW.slack)
+    assert frusta.may_show(corners(EVERYWHERE)).tolist() == [[True]]
+    assert frusta.may_show(torch.zeros(0, 2, 3).double()).shape == (0, 1)
     assert Frusta([], DRAW.slack).may_show(corners(EVERYWHERE)).shape == (1, 0)
 
 

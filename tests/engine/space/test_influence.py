@@ -54,14 +54,10 @@ def test_large_views_are_looked_at_in_small_pictures():
             sizes.extend((shot.crop.width, shot.crop.height) for shot in shots)
             return super().draw(gaussians, shots, **options)
 
-    views = ring_of_views(2, width=800, height=600)
-    found = influence(
-        random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching(use_native=False)
-    )
+    views, gaussians = ring_of_views(2, width=800, height=600), random_gaussians(20, size=0.2)
+    found = influence(gaussians, torch.zeros(20, dtype=torch.int64), views, Watching(use_native=False))
     assert set(sizes) == {(80, 60)}
-    full = weights(
-        random_gaussians(20, size=0.2), TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)]
-    )
+    full = weights(gaussians, TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)])
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
 
 

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions, ray_interval
 from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.types import Crop, View

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.render.primitive import SPLATS
-from abcd_ns.engine.render.projection import extents_of
-from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.projection import SPLATS, Splats, extents_of
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.tree import Box
@@ -81,38 +80,28 @@ def scattered(seed: int, count: int) -> Gaussians:
     return gaussians
 
 
-def project(gaussians: Gaussians, view: View):
-    """(means2d, radii, depths, conics), by gsplat's reference."""
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
-    covars, _ = _quat_scale_to_covar_preci(quats, gaussians.scales.exp(), True, False, triu=False)
-    radii, means2d, depths, conics, _ = _fully_fused_projection(
-        gaussians.means, covars, view.viewmat[None], view.K[None], view.width, view.height
-    )
-    return means2d[0], radii[0], depths[0], conics[0]
-
-
-def drawn_in_box(view: View, crop: Crop, box: Box, means2d, radii, depths, conics) -> torch.Tensor:
+def drawn_in_box(view: View, crop: Crop, box: Box, splats: Splats) -> torch.Tensor:
     """Whether any pixel of the crop has a fragment (alpha >= 1/255 at opacity 1) inside the box, [n]."""
-    dx = torch.arange(crop.x, crop.x + crop.width) + 0.5 - means2d[:, 0, None, None]
-    dy = torch.arange(crop.y, crop.y + crop.height)[:, None] + 0.5 - means2d[:, 1, None, None]
-    a, b, c = conics.T[..., None, None]
+    dx = torch.arange(crop.x, crop.x + crop.width) + 0.5 - splats.means2d[:, 0, None, None]
+    dy = torch.arange(crop.y, crop.y + crop.height)[:, None] + 0.5 - splats.means2d[:, 1, None, None]
+    a, b, c = splats.shapes.T[..., None, None]
     drawn = torch.exp(-0.5 * (a * dx**2 + c * dy**2) - b * dx * dy) >= 1 / 255
     directions = ray_directions(view, TileGrid(crop, 1)).view(3, crop.height, crop.width)
-    along = depths.double()[:, None, None, None] * directions.double()
+    along = splats.depths.double()[:, None, None, None] * directions.double()
     points = (view.center.double()[:, None, None] + along).movedim(1, -1)
     inside = box.contains(points.reshape(-1, 3)).reshape(drawn.shape)
-    return (radii > 0) & (drawn & inside).flatten(1).any(dim=1)
+    return (splats.radii > 0) & (drawn & inside).flatten(1).any(dim=1)
 
 
 def drawn_and_reached(seed: int, count: int, crop: Crop | None, lower: float, upper: list[float]):
     """Which Gaussians draw in a box around a point before the camera, and which are said to reach it."""
     view, gaussians = small_view(seed), scattered(seed, count)
-    means2d, radii, depths, conics = project(gaussians, view)
+    splats = TorchRasterizer(use_native=False).project(gaussians, view)
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle + lower, torch.tensor(upper).double() + middle)
-    blur = depths.clamp(min=0) * SPLATS.blur_pixels / view.K.diagonal()[:2].min()
+    blur = splats.depths.clamp(min=0) * SPLATS.blur_pixels / view.K.diagonal()[:2].min()
     reached = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant([view]))
-    return drawn_in_box(view, crop or view.full, box, means2d, radii, depths, conics), reached
+    return drawn_in_box(view, crop or view.full, box, splats), reached
 
 
 @given(SEEDS, st.sampled_from([None, Crop(8, 5, 20, 13)]))

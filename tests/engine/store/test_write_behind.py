@@ -10,8 +10,8 @@ import torch
 
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.visibility import bounds_of
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.commit import with_pending

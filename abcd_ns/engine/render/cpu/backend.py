@@ -11,8 +11,14 @@ from abcd_ns.engine.kernels import library
 from abcd_ns.engine.kernels.native import suits
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu import native, reference
-from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
-from abcd_ns.engine.render.projection import Splats, camera_numbers, check_degree, project_in_torch
+from abcd_ns.engine.render.projection import (
+    PRIMITIVES,
+    PrimitiveName,
+    Splats,
+    camera_numbers,
+    check_degree,
+    project_in_torch,
+)
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.together import Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
@@ -35,7 +41,6 @@ class TorchRasterizer(Rasterizer):
     Args:
         use_native: False draws everything in torch.
         tile_side: pixels along a tile's side; a divisor of 16. The native library has 4.
-        primitive: what a Gaussian is.
     """
 
     def __init__(

@@ -7,34 +7,32 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.native import address, library
-from abcd_ns.engine.render.primitive import Primitive
+from abcd_ns.engine.render.projection import Primitive
 from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow, window_between
+from abcd_ns.engine.render.z_window import TileGrid, ZWindow, window_between
 from abcd_ns.engine.types import Crop, Gaussians
 
 SIDE = 4
 """Of its tiles, px: a tile is 16 lanes."""
 COEFFICIENTS = (0, 3, 8, 15)
 """Of harmonics above degree 0, that it takes."""
-_POINTER = ctypes.c_void_p
 
 
 class _Parameters(ctypes.Structure):
     _fields_ = (
-        *((name, _POINTER) for name in ("means", "scales", "quats", "dc", "rest", "opacities")),
+        *((name, ctypes.c_void_p) for name in ("means", "scales", "quats", "dc", "rest", "opacities")),
         *((name, ctypes.c_int64) for name in ("n", "coefficients")),
     )
 
 
 class _Part(ctypes.Structure):
     _fields_ = (
-        ("planes", _POINTER),
+        ("planes", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in ("row", "count")),
         *((name, ctypes.c_int32) for name in ("picture", "masked")),
     )
@@ -43,12 +41,12 @@ class _Part(ctypes.Structure):
 class _Picture(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("x", "y", "width", "height")),
-        *((name, _POINTER) for name in ("near", "far")),
+        *((name, ctypes.c_void_p) for name in ("near", "far")),
     )
 
 
 class _Image(ctypes.Structure):
-    _fields_ = tuple((name, _POINTER) for name in ("color", "transmittance", "depth", "residual"))
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("color", "transmittance", "depth", "residual"))
 
 
 def _parameters(tensors: Sequence[Tensor]) -> _Parameters:
@@ -63,9 +61,8 @@ class _Project(torch.autograd.Function):
         *tensors, cameras, primitive = inputs
         tensors = [tensor.contiguous() for tensor in tensors]
         planes = cameras.new_empty((len(cameras), primitive.rows, len(tensors[0])))
-        views, given = ctypes.c_int64(len(cameras)), ctypes.byref(_parameters(tensors))
-        pointers = _POINTER(address(cameras)), views, _POINTER(address(planes))
-        library().abcd_project(int(primitive.name == "2dgs"), given, *pointers)
+        given = primitive.name == "2dgs", ctypes.byref(_parameters(tensors))
+        library().abcd_project(*given, address(cameras), len(cameras), address(planes))
         ctx.save_for_backward(*tensors, cameras)
         ctx.primitive = primitive
         return planes
@@ -75,9 +72,9 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, grad: Float[Tensor, "v r n"]) -> tuple[Tensor | None, ...]:
         *tensors, cameras = ctx.saved_tensors
         found, grad = [torch.empty_like(tensor) for tensor in tensors], grad.contiguous()
-        both = [ctypes.byref(_parameters(each)) for each in (tensors, found)]
-        pointers = _POINTER(address(cameras)), ctypes.c_int64(len(cameras)), _POINTER(address(grad))
-        library().abcd_project_back(int(ctx.primitive.name == "2dgs"), both[0], *pointers, both[1])
+        given = ctx.primitive.name == "2dgs", ctypes.byref(_parameters(tensors))
+        into = ctypes.byref(_parameters(found))
+        library().abcd_project_back(*given, address(cameras), len(cameras), address(grad), into)
         return *found, None, None
 
 
@@ -107,7 +104,7 @@ Pictures = list[tuple[Float[Tensor, "_h _w 3"], Float[Tensor, "_h _w"], Float[Te
 
 
 class Lists:
-    """What each tile of some pictures has to draw, front to back; and, once it was drawn, ResidualSums.
+    """What each tile of some pictures has to draw, front to back.
 
     Args:
         windows: leave out of masked parts what lies outside.
@@ -123,8 +120,6 @@ class Lists:
         wants_weights: bool,
     ) -> None:
         self.primitive, self.crops = primitive, tuple(crops)
-        self.values: Tensor | None = None
-        self.residuals: list[Tensor] | None = None
         self.absolute: Tensor | None = None
         """Gets gsplat's `absgrad` [v, n, 2] with the gradients, where no residuals are asked."""
         self._parts = [part.planes.detach().contiguous() for part in parts]  # read when gradients are taken
@@ -132,22 +127,17 @@ class Lists:
             _Part(address(planes), planes.shape[1], planes.shape[1], part.picture, part.masked)
             for planes, part in zip(self._parts, parts, strict=True)
         ]
-        pictures, parts_of_all = _Windowed(self.crops, windows), (_Part * len(rows))(*rows)
-        given = parts_of_all, ctypes.c_int64(len(rows)), pictures.rows, ctypes.c_int64(len(crops))
-        is_surfel = int(primitive.name == "2dgs")
-        self.handle = _POINTER(library().abcd_lists(is_surfel, *given, int(wants_weights)))
+        pictures = _Windowed(self.crops, windows)
+        of_parts, of_pictures = ((_Part * len(rows))(*rows), len(rows)), (pictures.rows, len(crops))
+        self.handle = library().abcd_lists(primitive.name == "2dgs", *of_parts, *of_pictures, wants_weights)
         weakref.finalize(self, library().abcd_free, self.handle)
 
     def draw(self, windows: Windows = (), keep: bool = False) -> Pictures:
-        """What lies in the windows.
-
-        Args:
-            keep: whether gradients will be asked for; without windows.
-        """
+        """What lies in the windows; without any, `keep` what gradients take."""
         sizes = [(crop.height, crop.width) for crop in self.crops]
         images = [(torch.empty((*size, 3)), torch.empty(size), torch.empty(size)) for size in sizes]
         pictures = _Windowed(self.crops, windows)
-        library().abcd_draw(self.handle, pictures.rows, _as_images(images), int(keep))
+        library().abcd_draw(self.handle, pictures.rows, _as_images(images), keep)
         return images
 
     def composite(
@@ -159,27 +149,23 @@ class Lists:
             means2d: does not change what is drawn, and gets the gradients of the middles.
             weights: [v, n], likewise of the depths.
         """
-        drawn = iter(_Composite.apply(planes, means2d, weights, self))
-        return list(zip(drawn, drawn, drawn, strict=True)), self
-
-    def ask(self, residuals: Sequence[Tensor]) -> None:
-        self.residuals = [residual.contiguous() for residual in residuals]
+        sums = ResidualSums()
+        drawn = iter(_Composite.apply(planes, means2d, weights, self, sums))
+        return list(zip(drawn, drawn, drawn, strict=True)), sums
 
     def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:
         """Which columns, numbered part by part, have a fragment in the windows."""
         columns = sum(planes.shape[1] for planes in self._parts)
-        found: UInt8[Tensor, n] = torch.zeros(columns, dtype=torch.uint8)
-        pictures = _Windowed(self.crops, windows)
-        library().abcd_members(self.handle, pictures.rows, _POINTER(found.data_ptr()))
-        return found.bool()
+        found, pictures = torch.zeros(columns, dtype=torch.bool), _Windowed(self.crops, windows)
+        library().abcd_members(self.handle, pictures.rows, address(found))
+        return found
 
     def shown(self, visible: float) -> list[Float[Tensor, "2 _t"]]:
         """By picture what z_window.showing returns."""
         sizes = [TileGrid(crop, SIDE).tiles for crop in self.crops]
         ends = torch.empty((2, sum(sizes)))
         sums = torch.empty((2, sum(sizes)), dtype=torch.float64)
-        pointers = [_POINTER(row.data_ptr()) for row in (*ends, *sums)]
-        library().abcd_windows(self.handle, ctypes.c_float(visible), *pointers)
+        library().abcd_windows(self.handle, visible, *map(address, (*ends, *sums)))
         parts = (row[None].split(sizes, dim=1) for row in (*ends, *sums))
         return [window_between(*each).flatten(1) for each in zip(*parts, strict=True)]
 
@@ -210,19 +196,19 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, planes: Tensor, _: Tensor, weights: Tensor | None, lists: Lists
+        ctx: Any, planes: Tensor, _: Tensor, weights: Tensor | None, lists: Lists, sums: ResidualSums
     ) -> tuple[Tensor, ...]:
         images = lists.draw(keep=any(ctx.needs_input_grad))
         outputs = tuple(tensor for image in images for tensor in image)
         ctx.save_for_backward(*outputs)
-        ctx.shape, ctx.lists, ctx.wants_weights = planes.shape, lists, weights is not None
+        ctx.shape, ctx.lists, ctx.sums, ctx.wants_weights = planes.shape, lists, sums, weights is not None
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        lists, (views, _, n), residuals = ctx.lists, ctx.shape, ctx.lists.residuals
+        lists, (views, _, n), residuals = ctx.lists, ctx.shape, ctx.sums.asked
         rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.wants_weights else None
         width = SUMS if residuals else 0 if lists.absolute is None else 2
         extra = torch.zeros((views, n, width)) if width else None
@@ -231,17 +217,11 @@ class _Composite(torch.autograd.Function):
         if residuals:
             asked = [[*given, residual] for given, residual in zip(asked, residuals, strict=True)]
         drawn = [ctx.saved_tensors[k : k + 3] for k in range(0, len(held), 3)]
-        library().abcd_draw_back(
-            lists.handle,
-            ctypes.c_int64(views * n),
-            _as_images(asked),
-            _as_images(drawn),
-            *(_POINTER(address(each)) for each in (rows, weights, extra)),
-            ctypes.c_int64(width),
-        )
+        given, found = (_as_images(asked), _as_images(drawn)), map(address, (rows, weights, extra))
+        library().abcd_draw_back(lists.handle, views * n, *given, *found, width)
         if residuals:
-            lists.values = extra
+            ctx.sums.values = extra
         elif lists.absolute is not None:
             lists.absolute.absgrad = extra
         center = slice(lists.primitive.center, lists.primitive.center + 2)
-        return rows, rows[:, center].transpose(1, 2).contiguous(), weights, None
+        return rows, rows[:, center].transpose(1, 2).contiguous(), weights, None, None

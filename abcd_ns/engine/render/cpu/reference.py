@@ -16,11 +16,10 @@ from torch.utils.checkpoint import checkpoint
 from abcd_ns.engine.render import splat_kernels as splat
 from abcd_ns.engine.render import surfel_kernels as surfel
 from abcd_ns.engine.render.cpu.native import Part, Pictures, Windows
-from abcd_ns.engine.render.primitive import Primitive
-from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums, SumsApart, about, moments
+from abcd_ns.engine.render.projection import Primitive
+from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums, about, moments
 from abcd_ns.engine.render.splat_kernels import DEPTH, GSPLAT_TILE, MIN_ALPHA, REACH_MARGIN, X, Y
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ends_of, showing
+from abcd_ns.engine.render.z_window import TileGrid, ends_of, showing
 from abcd_ns.engine.transfer import finest
 from abcd_ns.engine.types import Crop
 
@@ -69,7 +68,7 @@ class Lists:
             others = others.clone()
             others[DEPTH] = 0.0
         rows = torch.cat((torch.stack(own).flatten(1), others), dim=1)
-        return self._composited(rows), SumsApart(partial(self._residual_sums, planes.detach()))
+        return self._composited(rows), ResidualSums(partial(self._residual_sums, planes.detach()))
 
     def kept_ids(self, windows: Windows) -> Bool[Tensor, "n"]:
         found = torch.zeros(self.planes.shape[1], dtype=torch.bool, device=self.planes.device)

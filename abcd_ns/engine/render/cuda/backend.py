@@ -18,9 +18,8 @@ from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.kinds import kind_of
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
 from abcd_ns.engine.render.cuda.projection import place_on_screen, project
-from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
-from abcd_ns.engine.render.projection import Splats, extents_of
-from abcd_ns.engine.render.residual_sums import SumsApart
+from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName, Splats, extents_of
+from abcd_ns.engine.render.residual_sums import ResidualSums
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -139,7 +138,7 @@ class GsplatRasterizer(Rasterizer):
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
         if residual_sums:
-            info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
+            info["sums"] = ResidualSums(partial(drawing.residual_sums, own.centers.detach()))
         sheet = drawing.rasterized()
         return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]
 

@@ -17,8 +17,7 @@ class Drawn(Raster):
     """A crop of one camera's part of a sheet, which is cut out when somebody asks for it.
 
     Args:
-        features: of all cameras: colour and depth.
-        alphas: likewise.
+        features, alphas: of all cameras; colour and depth, and how much they hide.
         camera: whose part it is.
         part: rows and columns of the crop.
     """
@@ -70,11 +69,7 @@ class _Pictures(torch.autograd.Function):
 def pictures_of(
     rasters: Sequence[Raster], frames: Sequence[Frame]
 ) -> tuple[Float[Tensor, "_h _w 3"], ...] | None:
-    """What rasters look like in their frames, 0..1; None where no kernel can tell.
-
-    Args:
-        rasters: all of one `draw`.
-    """
+    """What rasters, all of one `draw`, look like in their frames, 0..1; None where no kernel can tell."""
     sheets: dict[int, list[int]] = {}
     for k, raster in enumerate(rasters):
         if not isinstance(raster, Drawn):

@@ -13,7 +13,7 @@ from gsplat.cuda._wrapper import (
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.primitive import PrimitiveName
+from abcd_ns.engine.render.projection import PrimitiveName
 from abcd_ns.engine.types import Gaussians, View
 
 OnScreen = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]
@@ -39,18 +39,10 @@ def _place_splats(
     gaussians: Gaussians, cameras: tuple[Tensor, Tensor], like: View, antialiased: bool
 ) -> OnScreen:
     """Shapes are conics."""
-    radii, means2d, depths, conics, compensations = fully_fused_projection(
-        gaussians.means,
-        None,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        *cameras,
-        like.width,
-        like.height,
-        near_plane=like.near,
-        packed=False,
-        calc_compensations=antialiased,
-    )
+    shapes, size = (None, gaussians.quats, gaussians.scales.exp()), (like.width, like.height)
+    options = {"near_plane": like.near, "packed": False, "calc_compensations": antialiased}
+    found = fully_fused_projection(gaussians.means, *shapes, *cameras, *size, **options)
+    radii, means2d, depths, conics, compensations = found
     return radii, means2d, depths, conics, means2d, compensations
 
 
@@ -61,23 +53,11 @@ def _place_surfels(
 
     The boxes' middles are found anew: gsplat's own gradient of theirs lacks some terms.
     """
-    radii, _, depths, rays, _ = fully_fused_projection_2dgs(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        *cameras,
-        like.width,
-        like.height,
-        near_plane=like.near,
-        packed=False,
-    )
+    discs, size = (gaussians.means, gaussians.quats, gaussians.scales.exp()), (like.width, like.height)
+    found = fully_fused_projection_2dgs(*discs, *cameras, *size, near_plane=like.near, packed=False)
+    radii, _, depths, rays, _ = found
     matrix = rays / rays[..., 2:, 2:]
-    centers, (a, b), (c, d), (e, f) = (
-        matrix[..., :2, 2],
-        matrix[..., 0, :2].unbind(-1),
-        matrix[..., 1, :2].unbind(-1),
-        matrix[..., 2, :2].unbind(-1),
-    )
+    centers, (a, b, c, d, e, f) = matrix[..., :2, 2], matrix[..., :2].flatten(-2).unbind(-1)
     u, v = matrix[..., :2, 2].unbind(-1)  # anew: these are no part of what `centers` gets as its gradient
     distance = e * e + f * f - 1
     off = ((a - u * e) * e + (b - u * f) * f, (c - v * e) * e + (d - v * f) * f)

@@ -20,12 +20,10 @@ from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Projected, corners, numbers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.residual_sums import SUMS, about, moments
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow, ends_of, showing
+from abcd_ns.engine.render.splat_kernels import GSPLAT_TILE as TILE
+from abcd_ns.engine.render.z_window import TileGrid, ZWindow, ends_of, showing
 from abcd_ns.engine.types import Crop, Layer
 
-TILE = 16
-"""gsplat's tile size, pixels."""
 LAST_DEPTH = 0x7FFFFFFF
 """No key's low half is larger: bits of a depth, which is positive."""
 
@@ -62,12 +60,9 @@ class FlatSplats:
             return FlatSplats(cameras, *values)
         firsts = cameras.view(count, n)[:, :1] if n else torch.arange(count, device=cameras.device)[:, None]
         each = Splats(torch.cat([splats.planes for _, splats in frozen], dim=1))
-        last = (
-            F.pad(each.colors, (0, 1))
-            if blend_weights
-            else torch.cat((each.colors, each.depths[:, None]), dim=-1)
-        )
-        theirs = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, last)
+        last = torch.zeros_like(each.depths) if blend_weights else each.depths
+        features = torch.cat((each.colors, last[:, None]), dim=-1)
+        theirs = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, features)
         frozen_cameras = [firsts[camera].expand(len(splats)) for camera, splats in frozen]
         pairs = zip(values, theirs, strict=True)
         return FlatSplats(torch.cat((cameras, *frozen_cameras)), *(torch.cat(pair) for pair in pairs))
@@ -179,11 +174,7 @@ class Drawing:
 
     @staticmethod
     def of(kind: Kind, splats: FlatSplats, crops: Sequence[Crop], *, windowed: bool = False) -> "Drawing":
-        """What may be drawn in a crop of each camera.
-
-        Args:
-            windowed: leave room for what windows are going to leave out.
-        """
+        """What may be drawn in a crop of each camera; `windowed` leaves room for what windows leave out."""
         layout = TileLayout(tuple(crops), windowed)
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
         by = corners(layout.tiled, splats.means2d)
@@ -192,18 +183,9 @@ class Drawing:
         if len(splats) == 0:
             return Drawing(kind, splats, means2d, shapes, layout, splats.cameras, splats.cameras.int())
         _, rows, cols = layout.shape
-        _, isect_ids, flatten_ids = isect_tiles(
-            means2d,
-            splats.radii,
-            splats.depths,
-            TILE,
-            cols,
-            rows,
-            packed=True,
-            n_cameras=len(crops),
-            camera_ids=splats.cameras,
-            gaussian_ids=splats.cameras,  # asked for, and not read
-        )
+        ids = {"camera_ids": splats.cameras, "gaussian_ids": splats.cameras}  # asked for, and not read
+        where, options = (means2d, splats.radii, splats.depths), {"packed": True, "n_cameras": len(crops)}
+        _, isect_ids, flatten_ids = isect_tiles(*where, TILE, cols, rows, **options, **ids)
         return Drawing(kind, splats, means2d, shapes, layout, isect_ids, flatten_ids)
 
     @property
@@ -217,12 +199,7 @@ class Drawing:
         return self.splats.depths.index_select(0, self.flatten_ids)
 
     def inside(self, windows: Sequence[ZWindow | None], always: int = 0) -> Bool[Tensor, "q"]:
-        """Which pairs lie within their tile's window.
-
-        Args:
-            windows: of each camera.
-            always: the first so many splats do.
-        """
+        """Which pairs lie within their tile's window; those of the first `always` splats do."""
         near, far = self.layout.spread(windows, self.splats.depths)
         tile, z = self.tile, self.z
         inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
@@ -244,9 +221,8 @@ class Drawing:
         """
         count = len(keep)
         place = torch.where(keep, keep.cumsum(0) - 1, count)  # the others: to one place, which is cut off
-        isect_ids = self.isect_ids.new_full((count + 1,), self.layout.last_key).scatter_(
-            0, place, self.isect_ids
-        )
+        isect_ids = self.isect_ids.new_full((count + 1,), self.layout.last_key)
+        isect_ids.scatter_(0, place, self.isect_ids)
         flatten_ids = self.flatten_ids.new_zeros(count + 1).scatter_(0, place, self.flatten_ids)
         return replace(self, isect_ids=isect_ids[:count], flatten_ids=flatten_ids[:count])
 
@@ -277,10 +253,8 @@ class Drawing:
     def windows(self, visible: float) -> list[ZWindow]:
         """Where the splats show in each crop; see z_window.showing."""
         _, rows, cols = self.layout.shape
-        near, far = showing(
-            self.layout.pixels(self.isect_ids.device), self.tile, self.z, self.weights(), visible
-        )
-        found = []
+        pixels, found = self.layout.pixels(self.isect_ids.device), []
+        near, far = showing(pixels, self.tile, self.z, self.weights(), visible)
         for k, grid in enumerate(self.layout.grids):
             sides = (side[k].view(rows, cols)[: grid.rows, : grid.cols].flatten() for side in (near, far))
             found.append(ZWindow(grid, *sides))
@@ -335,24 +309,14 @@ class Drawing:
         flatten_ids: Int[Tensor, "q"],
     ) -> tuple[Tensor, Tensor]:
         cameras, rows, cols = self.layout.shape
-        return self.kind.draw(
-            means2d,
-            shapes,
-            features,
-            opacities,
-            *self.layout.size,
-            TILE,
-            isect_offset_encode(self.isect_ids, cameras, cols, rows),
-            flatten_ids,
-            # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
-            masks=self.layout.drawn(means2d.device),
-            packed=True,
-        )
+        lists = isect_offset_encode(self.isect_ids, cameras, cols, rows), flatten_ids
+        # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
+        options = {"masks": self.layout.drawn(means2d.device), "packed": True}
+        splats = means2d, shapes, features, opacities
+        return self.kind.draw(*splats, *self.layout.size, TILE, *lists, **options)
 
     @property
     def parts(self) -> list[tuple[slice, slice]]:
         """Rows and columns of each crop in what is drawn of it."""
-        return [
-            crop.within(tiled).slices
-            for crop, tiled in zip(self.layout.crops, self.layout.tiled, strict=True)
-        ]
+        pairs = zip(self.layout.crops, self.layout.tiled, strict=True)
+        return [crop.within(tiled).slices for crop, tiled in pairs]

@@ -151,9 +151,8 @@ def photometric(
     rendered, photo, taps = rendered.contiguous(), photo.contiguous(), _taps(rendered.device)
     columns, lines = width - REACH, height - REACH
     loss, gradient = rendered.new_empty(()), torch.empty_like(rendered)
-    moments, by_moment, rows = map(
-        rendered.new_empty, ((5, 3, height, columns), (9, lines, columns), (9, lines, width))
-    )
+    sizes = (5, 3, height, columns), (9, lines, columns), (9, lines, width)
+    moments, by_moment, rows = map(rendered.new_empty, sizes)
     options = {"WINDOW": SSIM_WINDOW, "BLOCK": BLOCK}
     size = height, width
 

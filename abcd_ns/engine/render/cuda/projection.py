@@ -92,10 +92,9 @@ class Projected:
     def splats(self, camera: int, which: Int[Tensor, "k"] | None = None) -> Splats:
         """As one of the cameras sees them, or these of them."""
         values = (self.means2d, self.depths, self.shapes, self.opacities, self.features[..., :3], self.radii)
-        of_one = (
-            value[camera] if which is None else value[camera].index_select(0, which) for value in values
-        )
-        each = (value if value.dim() == 2 else value[:, None] for value in of_one)
+        of_one = (value[camera] for value in values)
+        chosen = (value if which is None else value.index_select(0, which) for value in of_one)
+        each = (value if value.dim() == 2 else value[:, None] for value in chosen)
         *rows, radii = (value.to(self.depths).T for value in each)
         bounds = radii.new_zeros((3, radii.shape[1]))  # as the CPU has them
         return Splats(torch.cat((*rows, bounds, radii)))
@@ -166,9 +165,8 @@ class _Features(torch.autograd.Function):
             seen = zip(directions, (radii > 0).unbind(), strict=True)
             colors = [spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen]
         ctx.graph = leaves, colors
-        features, dark = _shaded(
-            _stacked([color.detach() for color in colors]), None if blend_weights else last
-        )
+        drawn = _stacked([color.detach() for color in colors])
+        features, dark = _shaded(drawn, None if blend_weights else last)
         ctx.save_for_backward(dark)
         return features
 
@@ -178,10 +176,8 @@ class _Features(torch.autograd.Function):
         (dark,), (leaves, colors) = ctx.saved_tensors, ctx.graph
         ctx.graph = None  # else it would last as long as what was drawn
         upstream = grad[..., :3].masked_fill(dark, 0.0)
-        *directions, coefficients = torch.autograd.grad(
-            colors, leaves, upstream.unbind(), materialize_grads=True
-        )
-        directions = _stacked(directions)
+        found = torch.autograd.grad(colors, leaves, upstream.unbind(), materialize_grads=True)
+        directions, coefficients = _stacked(found[:-1]), found[-1]
         by_means = directions[0] if len(directions) == 1 else directions.sum(dim=0)
         by_eyes = -directions.sum(dim=1) if ctx.needs_input_grad[1] else None
         return by_means, by_eyes, coefficients[:, 0], coefficients[:, 1:], grad[..., 3], None, None, None

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
-from abcd_ns.engine.render.primitive import SPLATS, Primitive
+from abcd_ns.engine.render.projection import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.train.density.pruning import (

@@ -9,7 +9,6 @@ That is what these views ask for; others may not. So views are in two halves: h 
 the other, 2 h b - h^2 A, and the other way round. What only some views ask for is worth less than nothing.
 """
 
-import ctypes
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,15 +79,8 @@ def _add_natively(
     near = camera.new_full((1,), picture.view.near)
     given = (gaussians.means, gaussians.scales, gaussians.quats, picture.sums, torch.cat((camera, near)))
     given = [each.contiguous() for each in given]
-    library().abcd_worth(
-        ctypes.c_int64(len(table)),
-        *(ctypes.c_void_p(address(each)) for each in given),
-        ctypes.c_int64(axes),
-        ctypes.c_float(picture.share),
-        ctypes.c_void_p(address(table)),
-        ctypes.c_int64(COLUMNS),
-        ctypes.c_int64(start),
-    )
+    pointers, into = map(address, given), address(table)
+    library().abcd_worth(len(table), *pointers, axes, picture.share, into, COLUMNS, start)
 
 
 def _asked(
