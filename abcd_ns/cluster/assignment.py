@@ -39,7 +39,7 @@ class VisitTask:
     epoch: int
     health: BlockHealth
     light: dict[int, Tensor]  # by view in use, its transform, on the CPU; empty without any
-    poses: dict[str, str]  # as in RunState; likewise
+    poses: dict[int, bytes]  # as in RunState; likewise
     beside: dict[int, float]  # see `shown_beside`
     allowance: int | None  # Gaussians by which the block may grow; None for any number
 

@@ -30,8 +30,7 @@ from abcd_ns.cluster.assignment import (
 from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.commit import commit, with_pending
-from abcd_ns.engine.store.special_blocks import DEFERRED
-from abcd_ns.engine.train.coordinator import Coordinator, persist_after_visit
+from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import BlocksBusyError
@@ -82,9 +81,7 @@ class Dispatcher(Coordinator):
     @property
     def trains_elsewhere(self) -> bool:
         """Whether the warm-up, or a visit that was saved in its midst, is over."""
-        state = self.state
-        warms_up = state.visit == 0 and self.scene.has(DEFERRED) and self.progress < self.config.warmup
-        return state.active is None and not warms_up
+        return self.state.active is None and not self.run.warm_up_is_next
 
     def await_step(self) -> None:
         """As the trainer's. WorkersError says that a visit lost LOSSES of them, or that there are none."""
@@ -154,7 +151,7 @@ class Dispatcher(Coordinator):
             epoch=state.epoch,
             health=state.health.get(block, BlockHealth()),
             light={} if light is None else {v: light.of(v).detach().cpu() for v in active.views},
-            poses=self.run.poses.to_json(),
+            poses=self.run.poses.packed(),
             beside=self._beside(active),
             allowance=self._allowance(),
         )
@@ -247,7 +244,7 @@ class Dispatcher(Coordinator):
         state.health[block] = outcome.health
         active.layer_seconds = outcome.layer_seconds
         updates = commit(self.scene, block, outcome.state, self.config.recipe.migrate, visit.taken)
-        persist_after_visit(self.run, active, outcome.state, updates, epoch)
+        self.persist_visit(active, outcome.state, updates, epoch)
         queued = state.epoch == epoch and state.queue
         if not queued and all(other.assignment.task.epoch != epoch for other in self._in_flight):
             self.announce(EpochEnded(epoch, state.step))

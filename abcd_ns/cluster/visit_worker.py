@@ -171,7 +171,6 @@ class VisitWorker:
             active=copy.deepcopy(task.active),
         )
         run.poses.restore(task.poses)
-        run.take_poses()
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:

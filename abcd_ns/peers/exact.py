@@ -108,9 +108,9 @@ class ExactTrainer(Trainer):
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """Photometric, the mean of the samples'; what the density strategy asks for is added by block."""
-        losses, pairs = batch.losses(pictures, photos, self.config), zip(pictures, photos, strict=True)
+        pairs = zip(pictures, photos, strict=True)
         self._residuals = [photo[..., :3] - picture.detach() for picture, photo in pairs]
-        return sum(losses[1:], start=losses[0]) / len(losses)
+        return batch.loss(pictures, photos, self.config)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:  # noqa: ARG002
         """Pass 2, and a step of every block's optimizers."""

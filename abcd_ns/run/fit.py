@@ -12,9 +12,8 @@ from abcd_ns.cluster.forked_workers import can_fork
 from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
-from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, free_on_gpu, levels_of
+from abcd_ns.engine.train.recipe import FULL, Recipe
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.machine import threads_wanted
@@ -241,7 +240,7 @@ def _crop(budget: int, demand: Demand) -> int:
 
 def _fewest(gaussians: int, limit: int, sole: int) -> int:
     """Blocks for so many Gaussians."""
-    return 1 if gaussians <= FULL * sole else max(2, fewest_blocks(gaussians, limit, FULL))
+    return 1 if gaussians <= FULL * sole else max(2, math.ceil(gaussians / max(FULL * limit, 1.0)))
 
 
 def _refusal(budget: int, demand: Demand, downscale: str, memory: str) -> str:

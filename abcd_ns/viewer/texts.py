@@ -66,7 +66,7 @@ def time_left(run: Trainer) -> float | None:
     if not run.state.step or not progress > 0:
         return None
     steps, of_step = run.state.step / progress, run.stopwatch.seconds / run.state.step
-    prunes = config.density.prunes_at_end and not config.recipe.exact
+    prunes = config.density.prunes and not config.recipe.exact
     ranking = min(max(steps / run.scene.tree.num_blocks / RANKING, FEWEST), views)
     telling = min(max(steps / STEPS_EACH, FEWEST), MOST, views)
     pruning = ranking + FORWARD * (ROUNDS + 1) * telling if prunes else 0

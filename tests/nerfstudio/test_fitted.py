@@ -22,7 +22,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
         return photo(manager, row, crop)
 
     monkeypatch.setattr(AbcdDataManager, "photo", noted)
-    monkeypatch.setattr(FinalPruning, "is_wanted", False)  # it reads whole photos, and reduces them
+    monkeypatch.setattr(FinalPruning, "run", lambda _: None)  # it reads whole photos, and reduces them
     with monkeypatch.context() as patched:
         patched.setattr("abcd_ns.run.fit.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
-from abcd_ns.engine.gaussians.param_swap import nothing_active
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, attach, nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -142,6 +143,13 @@ def make_coordinator(
     if resume:
         coordinator.restore()
     return coordinator
+
+
+def activated(gaussians: Gaussians) -> tuple[Params, Optimizers]:
+    """Parameters and optimizers in which these are active, without a run."""
+    params, optimizers = nothing_active(gaussians.sh_degree)
+    attach(BlockState.fresh(gaussians), params, optimizers)
+    return params, optimizers
 
 
 def points_of(gaussians: Gaussians) -> PointCloud:

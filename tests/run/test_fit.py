@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, degree_with_room, levels_of, limits_at
+from abcd_ns.engine.train.recipe import FULL
 from abcd_ns.errors import UserError
 from abcd_ns.run.fit import FEW, LEAST_BLOCK, Demand, Fit, RamShares, find_fit, fit_run
 from abcd_ns.run.options import RunOptions
@@ -114,8 +114,8 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
         few = limits_at(training, degree).of_block(blocks)
         needs = dataclasses.replace(growing, active_degree=degree)
         assert needs.bytes_for(few) <= growing.bytes_for(most) < needs.bytes_for(few + 2)
-        assert degree_with_room(training, int(FULL * few), blocks, FULL) == degree
-        assert degree_with_room(training, int(FULL * few) + 1, blocks, FULL) == degree - 1
+        assert degree_with_room(training, int(FULL * few), blocks) == degree
+        assert degree_with_room(training, int(FULL * few) + 1, blocks) == degree - 1
 
 
 def test_as_many_harmonics_come_late_as_blocks_would_be_many():

@@ -13,8 +13,7 @@ from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import lowered
 from abcd_ns.engine.train.density.pruning import BLEND_SUMS
-from abcd_ns.engine.train.health.health import LATE_AFTER
-from abcd_ns.engine.train.health.health_rules import wider_than
+from abcd_ns.engine.train.health import LATE_AFTER, wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop
 from tests.reference.device_counts import Counts

@@ -65,21 +65,13 @@ class TrainingConfig:
         return max(self.sh_degree - self.limits.late_harmonics, 0)
 
     def room(self, scene: int, block: int, limit: int) -> int | None:
-        """Gaussians that may be added to a block of so many in a scene of so many; None for any number.
-
-        Args:
-            limit: of the block; 0 for none.
-        """
+        """Gaussians that may be added to a block with a limit, 0 for none; None for any number."""
         rooms = [] if self.density.limit is None else [self.density.limit - scene]
         rooms += [limit - block] if limit else []
         return min(rooms, default=None)
 
     def check(self) -> None:
-        """Look for options that are out of range or contradict each other.
-
-        Raises:
-            UserError: names the first that is.
-        """
+        """Look for options that are out of range or contradict each other; a UserError names the first."""
         recipe = self.recipe
         for name, fits, words in (
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from abcd_ns.engine.events import EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
@@ -27,11 +26,10 @@ from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
-from abcd_ns.engine.types import Gaussians
 
 AT_ONCE = 1e-3
-"""Seconds: what a long visit persists is written as soon as no other write is under way. The last one may
-have begun just now with a state of long ago; to count from that, a kill would lose twice `commit_seconds`."""
+"""Seconds: what a long visit persists is written as soon as no other write is under way. To count from that
+one, whose state may be old, a kill would lose twice `commit_seconds`."""
 
 
 class Coordinator(Trainer):
@@ -56,21 +54,19 @@ class Coordinator(Trainer):
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
-        self._final_pruning = None if target is None else FinalPruning(run, target)
+        prunes = target is not None and run.density.config.prunes
+        self._final_pruning = FinalPruning(run, target) if prunes else None
 
     # -- a step --------------------------------------------------------------------------------------
 
     @property
     def batch(self) -> int:
-        """Views in a step of the visit that is under way; the most that one draws where none is."""
+        """Views in a step, see `VisitTraining.batch`."""
         return self.visit.batch
 
     def next_batch(self) -> Batch:
-        """Begin a visit if none is under way, set the learning rates, and say what to train on next.
-
-        Raises:
-            NothingSeenError: no view sees any block.
-        """
+        """Begin a visit if none is under way, set the learning rates, and say what to train on next; a
+        NothingSeenError if no view sees any block."""
         self.stopwatch.start()
         # Before a step, not after one: a run that stops between two goes on to the same round.
         if self.poses is not None and self.poses.is_due:
@@ -88,11 +84,7 @@ class Coordinator(Trainer):
         return self.visit.loss(batch, pictures, photos)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done.
-
-        Args:
-            errors: the mean squared one of each picture; listeners are told the mean PSNR.
-        """
+        """As the trainer's: grows and prunes, and ends the visit when its steps are done."""
         if self.poses is not None:
             self.poses.count(len(rendered.views))
         self.visit.after_step(rendered, errors)
@@ -103,8 +95,8 @@ class Coordinator(Trainer):
 
     @property
     def finished(self) -> bool:
-        """Whether the budget is used up, and no block is active. Seconds may run out just after a visit was
-        found not to be over; then it takes one more step."""
+        """Whether the budget is used up, and no block is active. A visit that was found not to be over just
+        before takes one more step."""
         return self.state.active is None and super().finished
 
     # -- a visit -------------------------------------------------------------------------------------
@@ -122,61 +114,75 @@ class Coordinator(Trainer):
         """Persist the block, and what left it as pending migrants; cut what has outgrown a block."""
         active = self.run.active
         state = self.visit.finish()
-        if active.is_whole:
-            self._end_warm_up()
         self.visit.block.let_go()  # a worker, or the next footprints, may need the device's memory
+        if active.is_whole:
+            self._end_warm_up(state)
         updates = commit(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
             updates[ACTIVE] = state.nobody
         self.scene.clear_active()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
-        persist_after_visit(self.run, active, state, updates, self.state.epoch)
+        self.persist_visit(active, state, updates, self.state.epoch)
         if not active.is_whole and not self.state.queue:
             self.announce(EpochEnded(self.state.epoch, self.state.step))
 
     def complete(self) -> None:
-        """Take out what the complete run's pictures hardly miss, where options ask for it and there are
-        photos to tell. A run that resumes from a kill in its midst does it anew, with what is left by then. A
-        visit that is under way, as where a run goes on for no more steps, ends."""
+        """End a visit that is under way, as where a run resumes for no more steps, and prune for the last
+        time if options and photos allow. A run that was killed meanwhile does it anew, with what is left."""
         if self.state.active is not None:
             self.end_visit()
-        if (
-            self.state.pruned_at == self.state.step
-            or self._final_pruning is None
-            or not self._final_pruning.is_wanted
-        ):
-            return
-        self._final_pruning.run()
-        self.state.pruned_at = self.state.step
-        self.run.persist(self.scene.tree, {}, 0.0)
+        if self._final_pruning is not None and self.state.pruned_at != self.state.step:
+            self._final_pruning.run()
+            self.state.pruned_at = self.state.step
+            self.run.persist(self.scene.tree, {}, 0.0)
 
-    def _end_warm_up(self) -> None:
+    def _end_warm_up(self, state: BlockState) -> None:
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
         self.visit.influence = None  # it holds on to what was active
-        others = influence_on(
-            self.run, active_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
-        )
+        others = self._influence(state, self.scene.tree, sorted(unknown))
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
+
+    def _influence(self, scene: BlockState, tree: BlockTree, views: Iterable[int]) -> Influence:
+        """The influence of every block of the whole scene on these views."""
+        run, gaussians = self.run, scene.gaussians.to(self.device)
+        shown, owner = [run.views[view] for view in views], tree.assign(gaussians.means)
+        return influence(gaussians, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
 
     # -- persist and restore -------------------------------------------------------------------------
 
     @property
     def layer_limit(self) -> int:
         """Bytes that layers may take, on the device and in RAM."""
-        return self.room.total
+        return self.room.device + self.room.ram
 
     @property
     def layer_bytes(self) -> int:
         """Bytes that the layers of the visit that is under way take."""
         return self.visit.layers.nbytes if self.visit.layers else 0
 
+    def persist_visit(
+        self, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
+    ) -> None:
+        """Persist what a visit changed, blocks that have outgrown their limit in parts; tell listeners. The
+        updates are what is persisted of `state`, which the visit made of its block."""
+        run = self.run
+        tree, parts = cut_full(self.scene, updates, run.state, run.limits, run.announce)
+        if active.is_joint and tree.num_blocks > 1:
+            run.state.influence = self._influence(state, tree, run.views)
+        run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
+        block = None if active.is_whole else active.geometry.block
+        staying = len(state) if block is None else len(updates[block])
+        migrated, seconds = len(state) - staying, run.stopwatch.seconds - active.began
+        run.announce(
+            VisitEnded(active.number, epoch, block, staying, migrated, active.layer_seconds, seconds)
+        )
+
     def persist(self, within: float) -> None:
         """Persist the active block under a name of its own, and the run's state."""
         updates = {}
         if (active := self.state.active) is not None:
-            self.health.look_over()
             updates = {ACTIVE: self.visit.block.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:
@@ -189,43 +195,3 @@ class Coordinator(Trainer):
         if self.state.active is not None:
             self.visit.attach(self.state.active)
             self._read_ahead()
-
-
-def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Iterable[int]) -> Influence:
-    """The influence of every block on these views.
-
-    Args:
-        whole: all Gaussians of the scene, on the device.
-    """
-    shown = [run.views[view] for view in views]
-    owner = tree.assign(whole.means)
-    return influence(whole, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
-
-
-def persist_after_visit(
-    run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
-) -> None:
-    """Persist what a visit changed, blocks that have outgrown their limit in parts, and tell listeners.
-
-    Args:
-        state: what the visit made of its block.
-        updates: what is persisted of it.
-        epoch: that it belongs to.
-    """
-    tree, parts = cut_full(run.scene, updates, run.state, run.limits, run.announce)
-    if active.is_joint and tree.num_blocks > 1:
-        run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
-    run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
-    block = None if active.is_whole else active.geometry.block
-    staying = len(state) if block is None else len(updates[block])
-    run.announce(
-        VisitEnded(
-            active.number,
-            epoch,
-            block,
-            gaussians=staying,
-            migrated=len(state) - staying,
-            layer_seconds=active.layer_seconds,
-            seconds=run.stopwatch.seconds - active.began,
-        )
-    )

@@ -1,6 +1,6 @@
 """What is known of each block's health: counts of what was repaired, and its standing in words."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from abcd_ns.engine.store.special_blocks import BlockName
@@ -36,11 +36,7 @@ HealthByBlock = dict[BlockName, BlockHealth]
 
 
 def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -> str:
-    """How a block stands, in a few words.
-
-    Args:
-        views: by block, how many views were worth training it on when last looked at.
-    """
+    """How a block stands, in a few words, where so many views, see RunState, were worth training it on."""
     if views.get(block) == 0:
         return "seen by no view, left as it was"
     if record is None or record.visits == 0:
@@ -60,14 +56,14 @@ def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int
     if list(by_standing) == ["trained"]:
         lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
     else:
-        lines = [f"{_named(members)}: {words}" for words, members in by_standing.items()]
-    return lines + _repaired(health_by_block.values())
-
-
-def _named(blocks: list[int]) -> str:
-    word = "block" if len(blocks) == 1 else "blocks"
-    shown = ", ".join(map(str, blocks[:12])) + (", ..." if len(blocks) > 12 else "")
-    return f"{word} {shown}"
+        lines = []
+        for words, members in by_standing.items():
+            shown = ", ".join(map(str, members[:12])) + (", ..." if len(members) > 12 else "")
+            lines.append(f"{'block' if len(members) == 1 else 'blocks'} {shown}: {words}")
+    records = health_by_block.values()
+    totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
+    found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
+    return [*lines, ", ".join(found)] if found else lines
 
 
 REPAIRED = {
@@ -78,10 +74,3 @@ REPAIRED = {
     "pruned": "Gaussians pruned that filled too little of their views",
 }
 """What the counts of a BlockHealth say."""
-
-
-def _repaired(records: Iterable[BlockHealth]) -> list[str]:
-    records = list(records)
-    totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
-    found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
-    return [", ".join(found)] if found else []

@@ -22,11 +22,6 @@ class LayerRoom:
     ram: int = 0
     """For those that have no room on the device; see LayerStore."""
 
-    @property
-    def total(self) -> int:
-        """Both."""
-        return self.device + self.ram
-
     def parted(self, share: float) -> tuple["LayerRoom", "LayerRoom"]:
         """A share of it, and the rest."""
         first = LayerRoom(int(share * self.device), int(share * self.ram))
@@ -59,11 +54,7 @@ def layers_of_visit(
 
 
 def renderer_of(run: TrainingRun, scene: BlockScene) -> LayerRenderer:
-    """What draws a scene as the run's options have it.
-
-    Args:
-        scene: the run's, or what it would be.
-    """
+    """What draws a scene, the run's or what it would be, as the run's options have it."""
     return LayerRenderer(
         scene,
         run.rasterizer,
@@ -74,12 +65,8 @@ def renderer_of(run: TrainingRun, scene: BlockScene) -> LayerRenderer:
 
 
 def parts_bytes(run: TrainingRun, views: Iterable[View], blocks: int, share: float = 1.0) -> int:
-    """Size of the layers that may be held while nodes are folded.
-
-    Args:
-        blocks: that steps train by, one or several.
-        share: of what an accelerator has for them.
-    """
+    """Size of the layers that may be held while nodes are folded, where steps train by one block or several;
+    of an accelerator a share of what it has for them."""
     if run.device.type == "cpu":  # where a block is loaded from RAM to RAM
         return PARTS_BYTES
     needs = needs_of(run.config, max(view.full.pixels for view in views), blocks)

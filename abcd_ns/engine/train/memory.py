@@ -16,7 +16,7 @@ from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LEAST_PASS, PA
 from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.recipe import Limits
+from abcd_ns.engine.train.recipe import FULL, Limits
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.units import bytes_in_words
@@ -51,10 +51,8 @@ class DeviceNeeds:
         batch: views that are drawn at once.
         waiting: other views of a step, at most.
         crop_pixels: of a view that a step trains on at most; 0 is no limit.
-        levels: layers of one view that are held, at most, while the blocks around a visited one are folded:
-            as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
-        keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
-            budget of its own for them.
+        levels: layers of one view that are held, at most, while blocks are folded, see `levels_of`.
+        keeps: whether layers and photos are kept there, too. Not on the CPU, whose RAM has a budget for them.
         primitive: what a Gaussian is.
         active_degree: of harmonics of an active block; None for `sh_degree`, that of the scene.
     """
@@ -141,12 +139,8 @@ class DeviceNeeds:
 
 
 def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
-    """Gaussians of the warm-up: where not given, as many as take no more than a visit to a block does.
-
-    Args:
-        block: Gaussians of the largest block, one of several.
-        pixels: of the largest image.
-    """
+    """Gaussians of the warm-up: where not given, as many as take no more than a visit to the largest of
+    several blocks, which has so many, on images of so many pixels at most."""
     visit, warm_up = (needs_of(config, pixels, blocks) for blocks in (2, 1))
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
@@ -154,11 +148,8 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
 
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | None = None) -> DeviceNeeds:
-    """What a visit takes in a run on images of so many pixels at most, in one block or several.
-
-    Args:
-        sh_degree: of the active block; None for the one that limits count on.
-    """
+    """What a visit takes on images of so many pixels at most, in one block or several, whose degree is
+    `sh_degree`; None for the one that limits count on."""
     return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
 
@@ -178,35 +169,27 @@ def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
     limits = config.limits
     if sh_degree <= config.growing_degree:
         return limits
-    sole, block = (
-        limit
-        * needs_of(config, 0, blocks).gaussian_bytes
-        // needs_of(config, 0, blocks, sh_degree).gaussian_bytes
-        for blocks, limit in ((1, limits.sole_limit), (2, limits.block_limit))
+
+    def at_degree(limit: int, blocks: int) -> int:
+        before, now = (needs_of(config, 0, blocks, degree).gaussian_bytes for degree in (None, sh_degree))
+        return limit * before // now
+
+    return replace(
+        limits, sole_limit=at_degree(limits.sole_limit, 1), block_limit=at_degree(limits.block_limit, 2)
     )
-    return replace(limits, sole_limit=sole, block_limit=block)
 
 
-def degree_with_room(config: TrainingConfig, largest: int, blocks: int, full: float) -> int:
-    """The highest degree of spherical harmonics for which the largest of so many blocks has room.
-
-    Args:
-        largest: Gaussians.
-        full: share of its limit that a block may fill.
-    """
+def degree_with_room(config: TrainingConfig, largest: int, blocks: int) -> int:
+    """The highest degree of harmonics for which the largest of so many blocks, of `largest` Gaussians, has
+    room."""
     least = config.growing_degree
     degrees = range(config.sh_degree, least, -1)
-    return next((d for d in degrees if largest <= full * limits_at(config, d).of_block(blocks)), least)
+    return next((d for d in degrees if largest <= FULL * limits_at(config, d).of_block(blocks)), least)
 
 
 def levels_of(blocks: int) -> int:
-    """`DeviceNeeds.levels` of a balanced tree of so many blocks."""
+    """As many as a balanced tree of so many blocks is deep, and one; 0 where a block is the whole scene."""
     return 0 if blocks == 1 else math.ceil(math.log2(blocks)) + 1
-
-
-def fewest_blocks(gaussians: int, limit: int, full: float) -> int:
-    """Equal blocks for so many Gaussians, none of them above the share `full` of `limit`."""
-    return max(1, math.ceil(gaussians / max(full * limit, 1.0)))
 
 
 class OutOfRoomError(UserError):
@@ -216,11 +199,6 @@ class OutOfRoomError(UserError):
 def parameter_bytes(sh_degree: int) -> int:
     """Of one Gaussian: 59 floats with spherical harmonics of degree 3."""
     return FLOAT * (NUMBERS_WITHOUT_COLOR + 3 * (sh_degree + 1) ** 2)
-
-
-def active_bytes(gaussians: int, sh_degree: int) -> int:
-    """What an active block of so many Gaussians takes, pictures not counted."""
-    return gaussians * parameter_bytes(sh_degree) * ACTIVE_COPIES
 
 
 def projected_bytes(primitive: PrimitiveName) -> int:
@@ -250,12 +228,8 @@ def free_on_gpu(device: torch.device) -> int:
 
 
 def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
-    """Refuse a block that cannot fit.
-
-    Raises:
-        OutOfRoomError: the memory that is free does not suffice; says what would.
-    """
-    needed, free = active_bytes(gaussians, sh_degree), free_bytes(device)
+    """Refuse a block that cannot fit, by an OutOfRoomError that says what would help."""
+    needed, free = gaussians * parameter_bytes(sh_degree) * ACTIVE_COPIES, free_bytes(device)
     if needed > free:
         raise OutOfRoomError(
             f"A block of {gaussians:,} Gaussians takes {bytes_in_words(needed)}, but {device} has "

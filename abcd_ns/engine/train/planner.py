@@ -1,9 +1,8 @@
 """Which block is trained next, on which views, and for how many steps."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from statistics import median_high
-from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -13,7 +12,6 @@ from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_train
 from abcd_ns.engine.space.tree import in_float64
 from abcd_ns.engine.space.visibility import ROUNDING, Frusta, Optics
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, VisitKind
@@ -45,25 +43,20 @@ class BlocksBusyError(Exception):
     """All blocks whose turn it is are with workers."""
 
 
-@runtime_checkable
-class Visits(Protocol):
+class Visits(ABC):
     """Decides which block is trained when, and on what terms."""
 
+    @abstractmethod
     def begin(self, at_once: int = 1) -> ActiveVisit:
-        """The next visit, which from now on is the run's active one.
-
-        Args:
-            at_once: visits that are out at once, this one included.
-
-        Raises:
-            NothingSeenError: no view sees any block.
-        """
+        """The next visit, which from now on is the run's active one, of so many that are out at once; a
+        NothingSeenError if no view sees any block."""
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
         """Its block is active, at the visit's beginning or after a resume. What others see of it meanwhile:
         all that is active."""
         return lambda: active_gaussians(params)
 
+    @abstractmethod
     def room(self) -> int | None:
         """Gaussians that may be added to the block; None for any number."""
 
@@ -77,40 +70,26 @@ class Visits(Protocol):
         return pictures, photos
 
 
-def typical(views: Mapping[int, int]) -> int:
-    """Of the blocks that views see, by how many the median one is seen."""
-    return median_high(filter(None, views.values()))
-
-
-def views_of_step(config: TrainingConfig, blocks: int, trained: int) -> int:
-    """Views in a step of a block that was trained on so many, one of several: fewer while it is
-    under-trained, where its steps are larger for that."""
-    known = trained + config.recipe.trained_before if config.recipe.fast_start else None
-    return views_per_step(config.batch, blocks, known)
-
-
 class Planner(Visits):
     """ABCD's visits: epochs over all blocks that any view sees, after a warm-up; all that it remembers is in
     the run's state."""
 
     def __init__(self, run: TrainingRun) -> None:
-        self._run = run
-        self._config, self._budget, self._scene = run.config, run.budget, run.scene
+        self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
+
+    @property
+    def _state(self) -> RunState:
+        return self._run.state
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
-        passed over, and most of the time those that no picture showed when they were last visited.
-
-        Raises:
-            BlocksBusyError: the blocks that are left in this epoch are in flight.
-        """
-        run, state = self._run, self._run.state
+        passed over, and most of the time those that no picture showed when they were last visited. A
+        BlocksBusyError if the blocks that are left in this epoch are in flight."""
+        run, state = self._run, self._state
         began = run.stopwatch.seconds
-        if state.visit == 0 and self._scene.has(DEFERRED) and run.progress < self._config.warmup:
-            state.active = self._warm_up(run.sh_degree, began)
-        else:
-            state.active = self._next_visit(state, run.sh_degree, began, at_once)
+        state.active = self._warm_up() if run.warm_up_is_next else self._next_visit(at_once)
+        state.active.began = began
         state.visit += 1
         state.sh_degree = max(state.sh_degree, state.active.sh_degree)
         return state.active
@@ -124,44 +103,33 @@ class Planner(Visits):
             return (most if limit is None else min(most, limit - deferred)) - gaussians
         return self._config.room(run.count(), gaussians, run.limits.of_block(run.blocks))
 
-    def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
+    def _warm_up(self) -> ActiveVisit:
         """The visit in which the coarse model of all blocks is trained."""
-        crops = {index: view.full for index, view in self._run.views.items()}
-        geometry = VisitGeometry(WHOLE, crops)
-        return ActiveVisit(0, VisitKind.COARSE, geometry, sh_degree, UNLIMITED, geometry.views, began=began)
+        geometry = VisitGeometry(WHOLE, {index: view.full for index, view in self._run.views.items()})
+        degree = self._run.sh_degree
+        return ActiveVisit(0, VisitKind.COARSE, geometry, degree, UNLIMITED, geometry.views)
 
-    def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
+    def _next_visit(self, at_once: int) -> ActiveVisit:
         while True:
-            plan = self._next_plan(state, at_once)
+            plan = self._next_plan(at_once)
             views = self._may_see(plan.block)
             # Where nothing is known, or what shows the block has changed, all views are asked.
-            for ask in (partial(self._known_to_show, state), self._sampled, self._seeing):
-                active = self._visit(state, plan, views, ask(plan.block, views), sh_degree)
-                if active is not None:
-                    active.began = began
+            for ask in (self._known_to_show, self._sampled, self._seeing):
+                if (active := self._visit(plan, views, ask(plan.block, views))) is not None:
                     return active
 
     def _visit(
-        self,
-        state: RunState,
-        plan: VisitPlan,
-        views: Mapping[int, View],
-        showing: tuple[int, ...],
-        sh_degree: int,
+        self, plan: VisitPlan, views: Mapping[int, View], showing: tuple[int, ...]
     ) -> ActiveVisit | None:
-        """The next visit to a block; None if those of its views whose turn it is do not see it after all.
-
-        Args:
-            views: that may see the block.
-            showing: those of them that are worth training it on.
-        """
-        block, seed = plan.block, self._config.seed
+        """The next visit to a block, which is worth training on those of its views that show it; None if
+        those whose turn it is do not see it after all."""
+        state, block, seed = self._state, plan.block, self._config.seed
         state.views[block] = len(showing)
         if not showing:
             return None
         if self._scene.tree.num_blocks == 1:
-            return self._sole_visit(state, block, showing, sh_degree)
-        used, earlier = self._views_used(state, len(showing)), state.health.get(block, BlockHealth()).visits
+            return self._sole_visit(block, showing)
+        used, earlier = self._views_used(len(showing)), state.health.get(block, BlockHealth()).visits
         doubtful = tuple(sorted(views.keys() - set(showing)))
         chosen = visit_views(showing, used, earlier, seed)
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
@@ -180,7 +148,7 @@ class Planner(Visits):
             number=state.visit,
             kind=VisitKind.BLOCK,
             geometry=geometry,
-            sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
+            sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else self._run.sh_degree,
             steps=plan.steps,
             views=(*chosen, *looked_at),
             visible=visible,
@@ -189,27 +157,18 @@ class Planner(Visits):
             showing=showing,
         )
 
-    def _sole_visit(
-        self, state: RunState, block: int, showing: tuple[int, ...], sh_degree: int
-    ) -> ActiveVisit:
+    def _sole_visit(self, block: int, showing: tuple[int, ...]) -> ActiveVisit:
         """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
         block may grow anywhere."""
-        steps = UNLIMITED if self._budget.steps is None else self._budget.steps - state.step
-        geometry = VisitGeometry(block, {view: self._run.views[view].full for view in showing})
-        return ActiveVisit(state.visit, VisitKind.JOINT, geometry, sh_degree, steps, geometry.views)
+        run, total = self._run, self._run.budget.steps
+        steps = UNLIMITED if total is None else total - self._state.step
+        geometry = VisitGeometry(block, {view: run.views[view].full for view in showing})
+        return ActiveVisit(self._state.visit, VisitKind.JOINT, geometry, run.sh_degree, steps, geometry.views)
 
-    def _known_to_show(self, state: RunState, block: int, views: Iterable[int]) -> tuple[int, ...]:
-        """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as
-        that is known; empty if it is not."""
-        known = state.influence.get(block)
-        if known is None or self._config.recipe.influence_share >= 1:
-            return ()
-        seen = {view: known[view] for view in views if view in known}
-        return worth_training(seen, self._config.recipe.influence_share)
-
-    def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
+    def _next_plan(self, at_once: int) -> VisitPlan:
+        state = self._state
         while not state.queue:
-            self._plan_epoch(state, at_once)
+            self._plan_epoch(at_once)
         busy = sorted({visit.geometry.block for visit in state.in_flight})
         free = [place for place, plan in enumerate(state.queue) if plan.block not in busy]
         if not free:
@@ -217,49 +176,58 @@ class Planner(Visits):
         beside = overlaps(state.influence, (state.queue[place].block for place in free), busy)
         return state.queue.pop(free[beside.index(min(beside))])
 
-    def _plan_epoch(self, state: RunState, at_once: int) -> None:
+    def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
-        config = self._config
+        recipe, state, blocks = self._config.recipe, self._state, self._scene.tree.num_blocks
         if not state.views:
-            state.views = self._views_of_blocks(state)
+            state.views = {block: self._views_showing(block) for block in range(blocks)}
         else:
             state.epoch += 1
-            self._look_at_arrivals(state)
+            for block, seen in state.views.items():
+                # Others may have come into a block that no view saw.
+                if not seen and self._scene.pending_for(block) is not None:
+                    state.views[block] = self._views_seeing(block)
         if not any(state.views.values()):
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
-        remaining = None if self._budget.steps is None else self._budget.steps - state.planned
-        used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-        blocks = self._scene.tree.num_blocks
-        passes = passes_of_visit(config.recipe.passes, typical(used), at_once, blocks)
+        used = {block: self._views_used(seen) for block, seen in state.views.items()}
+        passes = passes_of_visit(recipe.passes, _typical(used), at_once, blocks)
         if state.epoch % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
-        steps = (passes, remaining, config.seed, config.recipe.visit_steps)
-        clocks = self._scene.clocks
-        batches = {block: views_of_step(config, blocks, clocks(block).adam_views) for block in used}
-        state.queue = list(plan_epoch(state.epoch, used, *steps, batches))
+        total = self._run.budget.steps
+        remaining = None if total is None else total - state.planned
+        batches = {block: self._views_of_step(block) for block in used}
+        options = passes, remaining, self._config.seed, recipe.visit_steps, batches
+        state.queue = list(plan_epoch(state.epoch, used, *options))
 
-    def _look_at_arrivals(self, state: RunState) -> None:
-        """A block that no view saw may be seen once others have come into it."""
-        for block, seen in state.views.items():
-            if not seen and self._scene.pending_for(block) is not None:
-                state.views[block] = self._views_that_see(block)
+    def _views_of_step(self, block: int) -> int:
+        """Fewer while the block is under-trained, where its steps are larger for that."""
+        config, trained = self._config, None
+        if config.recipe.fast_start:
+            trained = self._scene.clocks(block).adam_views + config.recipe.trained_before
+        return views_per_step(config.batch, self._scene.tree.num_blocks, trained)
 
-    def _views_of_blocks(self, state: RunState) -> dict[int, int]:
-        """As far as influences are known they tell; a visit looks again."""
-        views = {}
-        for block in range(self._scene.tree.num_blocks):
-            known = self._known_to_show(state, block, state.influence.get(block, ()))
-            views[block] = len(known) or self._views_that_see(block)
-        return views
+    def _views_used(self, seen: int) -> int:
+        """Of the views that see a block, how many a visit uses."""
+        limit = self._config.recipe.visit_views
+        return views_per_visit(seen, _typical(self._state.views), limit) if seen else 0
 
-    def _views_that_see(self, block: int) -> int:
+    def _views_showing(self, block: int) -> int:
+        """As many as are worth training it on, if that is known; a visit looks again."""
+        known = self._known_to_show(block, self._state.influence.get(block, ()))
+        return len(known) or self._views_seeing(block)
+
+    def _views_seeing(self, block: int) -> int:
         views = self._may_see(block)
         return len(self._sampled(block, views) or self._seeing(block, views))
 
-    def _seeing(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
-        """Those of the views that see the block."""
-        return self._footprints(block, views).views
+    def _known_to_show(self, block: int, views: Iterable[int]) -> tuple[int, ...]:
+        """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as
+        that is known; empty if it is not."""
+        known, share = self._state.influence.get(block), self._config.recipe.influence_share
+        if known is None or share >= 1:
+            return ()
+        return worth_training({view: known[view] for view in views if view in known}, share)
 
     def _sampled(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
         """Of MANY views, those in which a mean of the block's lies, as far as SAMPLE tell; of fewer, none."""
@@ -272,10 +240,9 @@ class Planner(Visits):
         holds = inner.may_show(points[:, None].expand(-1, 2, -1), rows).any(dim=0).tolist()
         return tuple(view for view, held in zip(views, holds, strict=True) if held)
 
-    def _views_used(self, state: RunState, seen: int) -> int:
-        """Of the views that see a block, how many a visit uses."""
-        limit = self._config.recipe.visit_views
-        return views_per_visit(seen, typical(state.views), limit) if seen else 0
+    def _seeing(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
+        """Those of the views that see the block."""
+        return self._footprints(block, views).views
 
     def _may_see(self, block: int) -> dict[int, View]:
         """The views whose frusta meet the block's bounds, by index."""
@@ -296,3 +263,8 @@ class Planner(Visits):
             return VisitGeometry(block, {})
         gaussians = self._scene.stored_with_pending(block).to(self._run.device)
         return footprints(gaussians, block, views.values(), self._run.rasterizer, share)
+
+
+def _typical(views: Mapping[int, int]) -> int:
+    """Of the blocks that views see, by how many the median one is seen."""
+    return median_high(filter(None, views.values()))

@@ -64,6 +64,10 @@ class Recipe:
     """Views that every block counts as trained on when the run begins."""
 
 
+FULL = 0.75
+"""Share of its limit over which a block is cut: the next visit needs room to grow."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """What fits on the device: `ns-train` derives it from the memory that training may take. 0 is no limit
@@ -92,3 +96,7 @@ class Limits:
     def of_block(self, blocks: int) -> int:
         """Gaussians that a block may hold in a scene of so many; 0 is no limit."""
         return (self.sole_limit if blocks == 1 else 0) or self.block_limit
+
+    def is_full(self, gaussians: int, blocks: int) -> bool:
+        """Whether a block of so many Gaussians, in a scene of so many blocks, is to be cut."""
+        return self.block_limit > 0 and gaussians > FULL * self.of_block(blocks)

@@ -1,7 +1,6 @@
 """What all parts of a training share: options, the stored scene, active parameters, where the run stands."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from statistics import median
 
 import torch
@@ -12,13 +11,12 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import VisitScene
-from abcd_ns.engine.store.special_blocks import BlockName
+from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.train.capture.light import HeldLight, Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
-from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.health.health import Health
+from abcd_ns.engine.train.health import Health
 from abcd_ns.engine.train.memory import degree_with_room, limits_at
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
@@ -30,7 +28,6 @@ class TrainingRun:
     """One training run over a scene, through the caller's parameters and optimizers.
 
     Args:
-        views: the training views; `View.index` names them.
         params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
             learning rates; that of the means is the one to decay from.
         light: each photo's; None for what the options ask for, not found yet.
@@ -51,7 +48,7 @@ class TrainingRun:
     ) -> None:
         self.config, self.budget, self.scene = config, budget, scene
         self.params, self.optimizers = params, optimizers
-        self.views = {view.index: view for view in views}  # on the CPU, whatever the device
+        self.poses = Poses(views)
         self._reduced = {1: self.views}
         self._shortest = min((min(view.width, view.height) for view in views), default=0)
         self.rasterizer = rasterizer
@@ -62,22 +59,23 @@ class TrainingRun:
         self.light = light
         if light is None and config.light != "none":
             self.light = Light(config.light, list(self.views), self.device)
-        self.poses = Poses(views)
         may_act = config.recipe.limit_scales and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.density = DensityControl(config.density.for_views(len(views)), rasterizer.primitive)
 
+    @property
+    def views(self) -> dict[int, View]:
+        """The training views by index, as they stand by now; on the CPU, whatever the device."""
+        return self.poses.views
+
     def views_at(self, reduction: int) -> dict[int, View]:
-        """The training views by index, their pictures reduced."""
+        """The same, their pictures reduced."""
+        if self._reduced[1] is not self.views:
+            self._reduced = {1: self.views}
         if reduction not in self._reduced:
             views = {index: view.reduced(reduction) for index, view in self.views.items()}
             self._reduced[reduction] = views
         return self._reduced[reduction]
-
-    def take_poses(self) -> None:
-        """Views stand where `poses` has them from now on."""
-        self.views = {i: replace(view, viewmat=self.poses.of(i)) for i, view in self.views.items()}
-        self._reduced = {1: self.views}
 
     def reach(self, views: Iterable[int]) -> float:
         """What the means' rate is multiplied by for a block that these views are trained on, world units."""
@@ -96,6 +94,12 @@ class TrainingRun:
         """That the scene is trained by: one in the warm-up, which trains all at once."""
         active = self.state.active
         return 1 if active is not None and active.is_whole else self.scene.tree.num_blocks
+
+    @property
+    def warm_up_is_next(self) -> bool:
+        """Whether the run has yet to train its coarse model."""
+        begins = self.state.visit == 0 and self.scene.has(DEFERRED)
+        return begins and self.progress < self.config.warmup
 
     @property
     def progress(self) -> float:
@@ -125,7 +129,7 @@ class TrainingRun:
         if self.share >= config.density.refine_stop:
             alone = self.state.active is not None and self.state.active.is_alone
             counts = [len(self.params["means"])] if alone else map(self.scene.count, range(blocks))
-            found = degree_with_room(config, max(counts), blocks, FULL)
+            found = degree_with_room(config, max(counts), blocks)
         return max(self.state.sh_degree, found)
 
     @property
@@ -135,11 +139,7 @@ class TrainingRun:
 
     @property
     def active(self) -> ActiveVisit:
-        """The visit that is under way.
-
-        Raises:
-            RuntimeError: none is.
-        """
+        """The visit that is under way; a RuntimeError if none is."""
         if self.state.active is None:
             raise RuntimeError("no visit is under way: call next_batch first")
         return self.state.active
@@ -151,7 +151,7 @@ class TrainingRun:
     def persist(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
         """Persist blocks and the run's state, as one snapshot; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
-        self.state.poses = self.poses.to_json()
+        self.state.poses = self.poses.packed()
         tables = self.light.changed() if self.light is not None else {}
         self.scene.persist(tree, {**updates, **tables}, self.state.to_json(), within)
 
@@ -161,6 +161,4 @@ class TrainingRun:
         self.stopwatch = Stopwatch(self.state.seconds)
         if self.light is not None:
             self.light.restore(self.scene.table)
-        if self.state.poses:
-            self.poses.restore(self.state.poses)
-            self.take_poses()
+        self.poses.restore(self.state.poses)

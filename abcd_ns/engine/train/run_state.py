@@ -65,12 +65,11 @@ class ActiveVisit:
     views: tuple[int, ...]
     """Indices of the views in use, of those that see the block."""
     showing: tuple[int, ...] = ()
-    """Indices of the views that are worth training the block on, of which each visit uses some; empty where
-    they are all in use."""
+    """Those that are worth training the block on, of which each visit uses some; empty where all are used."""
     visible: dict[int, tuple[int, ...]] = field(default_factory=dict)
     """By view, the blocks that its layers show, see `influence.visible_blocks`; missing views show all."""
     looked_at: tuple[int, ...] = ()
-    """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
+    """Those in use that hardly show the block, as far as known: to see whether they still do not."""
     done: int = 0
     saved: bool = False
     """Whether the active block was persisted in the middle of the visit, see special_blocks.ACTIVE."""
@@ -113,11 +112,7 @@ class ActiveVisit:
         return self.kind is not VisitKind.BLOCK
 
     def share(self, progress: float) -> float:
-        """Share of the visit's part of the run that is done, 0..1; that part is mostly all of it.
-
-        Args:
-            progress: share of the run.
-        """
+        """Share of the visit's part of the run, mostly all of it, that is done at a share of the run."""
         if self.until <= self.since:  # time ran out as it began
             return 1.0
         return min(max((progress - self.since) / (self.until - self.since), 0.0), 1.0)
@@ -140,8 +135,8 @@ class RunState:
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)
     """As far as known; blocks that are missing are trained on all views that see them."""
-    poses: dict[str, str] = field(default_factory=dict)
-    """See Poses, as stored; empty where all are as they were given."""
+    poses: dict[int, bytes] = field(default_factory=dict)
+    """See Poses.packed; empty where all are as they were given."""
     uses: float = 0.0
     """Of each view by the whole scene, so far; counted where poses are refined. A block is its part of it."""
     posed: float = 0.0
@@ -152,8 +147,7 @@ class RunState:
     """What had to be repaired, by block."""
     active: ActiveVisit | None = None
     in_flight: list[ActiveVisit] = field(default_factory=list)
-    """Visits that workers are at, in the order in which they began. Who goes on from here plans them
-    anew."""
+    """Visits that workers are at, in the order in which they began; a run that resumes plans them anew."""
     seconds: float = 0.0
     """Training time up to the last save."""
 
@@ -180,20 +174,14 @@ class RunState:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":
-        """The inverse of `to_json`; of nothing, as in a store that is new, a run that has not begun. What
-        older versions wrote besides is passed over."""
+        """The inverse of `to_json`; of nothing, a new run. What older versions had besides is ignored."""
         state = msgspec.convert(data, RunState, str_keys=True)
         state.health = {from_text(block): record for block, record in state.health.items()}
         return state
 
 
 class Stopwatch:
-    """Seconds of training; can be paused for what does not count.
-
-    Args:
-        seconds: so far.
-        clock: tells the time, in seconds since whenever.
-    """
+    """Seconds of training, after so many before; can be paused for what does not count."""
 
     def __init__(self, seconds: float = 0.0, clock: Callable[[], float] = time.perf_counter) -> None:
         self._before, self._clock = seconds, clock

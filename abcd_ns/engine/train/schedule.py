@@ -1,14 +1,15 @@
 """Which block next, for how many steps, on which views: pure functions of integers.
 
-There is one step budget for the whole scene. An epoch visits every block that some view sees; what its steps
-draw is proportional to the number of those views, as in joint training (docs/design.md: blocks that few
-views see overfit otherwise).
+There is one step budget for the whole scene. An epoch visits every block that some view sees; what its
+steps draw is proportional to the number of those views, as in joint training: blocks that few see
+overfit otherwise.
 """
 
 import math
 import random
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -16,19 +17,14 @@ T = TypeVar("T")
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks, of one that was trained on many views."""
 UNDER_TRAINED = 500
-"""Views that a block was trained on when a visit is planned, the warm-up's included, below which its steps
-draw one; two below twice as many, and so on. An under-trained block's steps are as large whatever they draw,
-see `rates_of_under_trained`: so there are more of them."""
-COARSE_MODEL_PASSES, WARM_UP_PASSES = 24, 32
+"""Views that a block was trained on, the warm-up's included, below which its steps draw one; two below twice
+as many, and so on. Its steps are as large whatever they draw, see `rates_of_under_trained`."""
+COARSE_MODEL_PASSES, WARM_UP_PASSES, LONGER = 24, 32, 2.4
 """Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
-soon are as good as they can be. Elsewhere at least, but for ..."""
-LONGER = 2.4
-"""... so many times its share of the run at most: a run that cannot often show all views to the whole scene
-can do so even less to each block."""
-
+soon are as good as they can be; elsewhere at least, but no longer than so many times its share of the run. A
+run that cannot often show all views to the whole scene can do so even less to each block."""
 LEAST_SIDE = 100
 """Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
-
 FEW_VIEWS = 32
 """Of a visit: with more, a visit uses each less often, and is as long."""
 SHORTER = 4
@@ -49,33 +45,16 @@ class VisitPlan(NamedTuple):
 
 
 def warm_up_is_over(progress: float, uses: float, share: float, deferred: int) -> bool:
-    """Whether the coarse model has been trained for long enough.
-
-    Args:
-        progress: share of the run that is done.
-        uses: of each view so far.
-        share: of the run, for the warm-up: `TrainingConfig.warmup`.
-        deferred: Gaussians that had no room in the coarse model.
-    """
+    """Whether the coarse model has been trained for long enough, by uses of each view so far, where `share`
+    of the run is the warm-up's and the coarse model has no room for so many Gaussians."""
     if deferred:
-        return warmed(progress, uses, share, deferred) >= 1
+        return progress >= share or uses >= COARSE_MODEL_PASSES
     return progress >= share and (uses >= WARM_UP_PASSES or progress >= LONGER * share)
 
 
-def warmed(progress: float, uses: float, share: float, deferred: int) -> float:
-    """The share of the shortest warm-up that there may be which is done; see `warm_up_is_over`."""
-    done = progress / share if share > 0 else 1.0
-    return max(done, uses / COARSE_MODEL_PASSES) if deferred else done
-
-
 def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
-    """How often a visit uses each of its views.
-
-    Args:
-        passes: where one block is trained after the other, and a visit uses FEW_VIEWS or fewer.
-        used: views that a visit to the block uses that most views see.
-        at_once: visits that are in flight at the same time: they are shorter, by the share of other blocks.
-    """
+    """How often a visit uses each view: `passes` times, where it is alone, and that to the median block has
+    FEW_VIEWS or fewer. Visits that are in flight at once are shorter, by the share of other blocks."""
     alone = math.ceil(passes * min(1.0, FEW_VIEWS / max(used, 1)))
     unseen = min((at_once - 1) / max(blocks - 1, 1), 1.0)
     return alone / (1 + (SHORTER - 1) * unseen)
@@ -94,7 +73,6 @@ def plan_epoch(
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
-        passes: how often a visit uses each of its views.
         remaining: steps left in the budget, or None without one. Where they do not suffice for the epoch,
             or would leave less than half an epoch behind, all visits are scaled to use up exactly these.
         each: steps of every visit, whatever its views; 0 shares them out by views.
@@ -116,11 +94,8 @@ def plan_epoch(
 
 
 def views_per_step(batch: int, blocks: int, trained: int | None = None) -> int:
-    """`TrainingConfig.batch`, its 0 resolved.
-
-    Args:
-        trained: views that a block was trained on; None for the most that a step draws.
-    """
+    """`TrainingConfig.batch`, its 0 resolved for a block that was trained on so many views; None for the most
+    that a step draws."""
     if batch:
         return batch
     most = 1 if blocks == 1 else DEFAULT_BATCH
@@ -134,25 +109,17 @@ def evenly(values: Sequence[T], wanted: int) -> list[T]:
 
 
 def views_per_visit(seen: int, typical: int, limit: int) -> int:
-    """How many of the `seen` views of a block a visit uses.
-
-    The same share of every block's views, so that what steps draw stays in proportion, and `limit` for a
-    block that as many views see as the median block, `typical`. A visit draws F and B for each view it uses:
-    it uses twice the limit at most.
-    """
+    """How many of the `seen` views of a block a visit uses: the same share of every block's, so that what
+    steps draw stays in proportion, and `limit` for a block that as many views see as the median one,
+    `typical`. It draws F and B for each: it uses twice the limit at most."""
     share = -(-seen * min(limit, typical) // typical)  # rounded up
     return min(seen, share, 2 * limit)
 
 
 def visit_views(views: tuple[int, ...], count: int, visits: int, seed: int) -> tuple[int, ...]:
     """The views of a block's visit after `visits` earlier ones: in turn, all are used equally often."""
-    start, cycles = visits * count, []
-    for cycle in range(start // len(views), (start + count - 1) // len(views) + 1):
-        shuffled = list(views)
-        random.Random(f"cycle {seed} {cycle}").shuffle(shuffled)
-        cycles += shuffled
-    offset = start % len(views)
-    return tuple(dict.fromkeys(cycles[offset : offset + count]))
+    places = range(visits * count, (visits + 1) * count)
+    return tuple(dict.fromkeys(_in_turn(views, place, f"cycle {seed}") for place in places))
 
 
 def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tuple[int, ...]:
@@ -168,15 +135,19 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tup
 
 def endless_order(views: tuple[int, ...], index: int, seed: int) -> int:
     """The view of step `index` where nobody knows how many there will be: shuffled passes over all views."""
+    return _in_turn(views, index, f"scaffold {seed}")
+
+
+def _in_turn(views: tuple[int, ...], index: int, name: str) -> int:
     number, place = divmod(index, len(views))
-    return views[_one_pass(len(views), number, seed)[place]]
+    return views[_one_pass(len(views), f"{name} {number}")[place]]
 
 
 @lru_cache(maxsize=16)
-def _one_pass(count: int, number: int, seed: int) -> tuple[int, ...]:
-    """An order of so many places."""
+def _one_pass(count: int, name: str) -> tuple[int, ...]:
+    """The order of so many places that a name stands for."""
     shuffled = list(range(count))
-    random.Random(f"scaffold {seed} {number}").shuffle(shuffled)
+    random.Random(name).shuffle(shuffled)
     return tuple(shuffled)
 
 
@@ -192,21 +163,15 @@ def final_decay(progress: float, views: int) -> float:
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:
-    """By how much pictures are reduced: to a quarter, then to a half of their width, then not at all.
-
-    Args:
-        coarse: share of the run after which they are not.
-        shortest: side of any picture, pixels.
-    """
+    """By how much pictures are reduced: to a quarter, then to a half of their width, and after the share
+    `coarse` of the run not at all; `shortest` is the least side of any, pixels."""
     wanted = 4 if progress < coarse / 2 else 2 if progress < coarse else 1
     return max(by for by in (1, 2, 4) if by == 1 or (by <= wanted and shortest // by >= LEAST_SIDE))
 
 
 def sh_degree_at(progress: float, ramp: float, highest: int) -> int:
-    """The degree of spherical harmonics in use: one more at each third (for degree 3) of the ramp.
-
-    With ramp = 0.1 and 30,000 steps this is splatfacto's one degree every 1,000 steps.
-    """
+    """The degree of spherical harmonics in use: one more at each third (for degree 3) of the ramp. A ramp of
+    0.1 of 30,000 steps is splatfacto's one degree every 1,000 steps."""
     if ramp <= 0:
         return highest
     # 1e-9 keeps degree n exactly at n / highest of the ramp, where the product may fall just below n.
@@ -215,10 +180,5 @@ def sh_degree_at(progress: float, ramp: float, highest: int) -> int:
 
 def _apportion(total: int, weights: list[int]) -> list[int]:
     """Integers in proportion to `weights` that add up to `total` exactly (cumulative rounding)."""
-    whole, given, cumulative, shares = sum(weights), 0, 0, []
-    for weight in weights:
-        cumulative += weight
-        upto = total * cumulative // whole
-        shares.append(upto - given)
-        given = upto
-    return shares
+    cuts = [total * end // sum(weights) for end in accumulate(weights, initial=0)]
+    return [after - before for before, after in pairwise(cuts)]

@@ -46,12 +46,8 @@ class Trainer(ABC):
 
     @abstractmethod
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """Call after the optimizers stepped.
-
-        Args:
-            rendered: what all parts of the step drew, or what is kept of it.
-            errors: the mean squared one of each picture; listeners are told the mean PSNR.
-        """
+        """Call after the optimizers stepped, with what all parts of the step drew, or what is kept of it, and
+        each picture's mean squared error; listeners are told the mean PSNR."""
 
     def complete(self) -> None:  # noqa: B027 - most have nothing left to do
         """Call when the run is finished: does what comes after the last step, if it was not done."""
@@ -64,11 +60,7 @@ class Trainer(ABC):
         return False
 
     def await_step(self) -> None:
-        """Return when one more step of the run has been taken, or the run is finished.
-
-        Raises:
-            RuntimeError: steps are not taken elsewhere.
-        """
+        """Return when one more step of the run has been taken elsewhere, or the run is finished."""
         raise RuntimeError("steps are taken here: call next_batch")
 
     def await_visits(self) -> bool:
@@ -134,11 +126,7 @@ class Trainer(ABC):
         """Persist what is active, and the run's state; on disk within so many seconds."""
 
     def save(self, pin: str | None = None) -> None:
-        """Commit everything, what is active included.
-
-        Args:
-            pin: keep this state under a name until it is unpinned.
-        """
+        """Commit everything, what is active included; with a `pin`, keep it under that name."""
         self.persist(0.0)
         if pin is not None:
             self.scene.store.pin(pin)

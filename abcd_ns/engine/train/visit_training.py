@@ -1,7 +1,6 @@
 """The training of one visit's block, from its first step to its last: in whichever process has the block."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,7 +15,7 @@ from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
-from abcd_ns.engine.train.health.health_rules import share_of_picture
+from abcd_ns.engine.train.health import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
@@ -40,16 +39,11 @@ from abcd_ns.engine.train.step.batch import (
     Sample,
     part_to_draw,
 )
-from abcd_ns.engine.types import Crop, View
 
 
 class VisitTraining:
-    """Attaches a block between its layers, takes its steps, and gives back what they made of it.
-
-    Args:
-        visits: on what terms the block is trained.
-        room: for layers.
-    """
+    """Attaches a block between its layers, takes its steps on the terms of `visits`, and gives back what they
+    made of it."""
 
     def __init__(self, run: TrainingRun, visits: Visits, room: LayerRoom) -> None:
         self.run, self._visits, self._room = run, visits, room
@@ -114,39 +108,29 @@ class VisitTraining:
         trained = self.block.clocks.adam_views + run.config.recipe.trained_before
         damping = final_decay(run.progress, trained) if decays else 1.0
         self._pace.set(self.batch, trained, decay, damping)
-        step, first = run.state.step, run.active.done * self.batch
+        first = run.active.done * self.batch
         views = self._views_of(range(first, first + self.batch + COMING))
         run.announce(PhotosWanted(views))
-        now = enumerate(views[: self.batch])
-        samples = tuple(self._sample(view, place, step) for place, view in now)
-        return Batch(step, samples, run.config.limits.batch_limit)
+        samples = tuple(self._sample(view, place) for place, view in enumerate(views[: self.batch]))
+        return Batch(run.state.step, samples, run.config.limits.batch_limit)
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in its parameters."""
         rendered = self._rendered = self._draw(batch.samples)
         if not self.run.active.shown:
-            for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
-                self.run.health.see(share_of_picture(sample.in_front, own))
+            for sample, raster in zip(batch.samples, rendered.rasters, strict=True):
+                self.run.health.see(share_of_picture(sample.in_front, raster.transmittance))
         return rendered
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """What a batch adds to the loss of a step: photometric over what of the crops says something about
-        the block, the mean of the samples'."""
-        run = self.run
+        """What a batch adds to the loss of a step: over what of the crops says something about the block."""
         pictures, photos = self._visits.compared(batch, pictures, photos)
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         self._rendered = None
-        losses = batch.losses(pictures, photos, run.config)
-        loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
-        return loss if batch.share == 1 else loss * batch.share
+        return batch.loss(pictures, photos, self.run.config)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """Call after the optimizers stepped: grows and prunes.
-
-        Args:
-            rendered: what all parts of the step drew, or what is kept of it.
-            errors: the mean squared one of each picture; listeners are told the mean PSNR.
-        """
+        """As Trainer.after_step: grows and prunes."""
         run, active = self.run, self.run.active
         taken = len(rendered.views)
         self._adapt_light(rendered)
@@ -154,10 +138,8 @@ class VisitTraining:
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(errors)
-        self.block.count_step(self.batch, taken)
-        clock = self.block.density_clock(taken, self.batch, self._visits.room())
-        judged = self._residuals.found()
-        self.block.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
+        seen = rendered.infos, self._residuals.found()
+        clock = self.block.after_step(taken, self.batch, self._visits.room(), *(seen if sound else ((), ())))
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.block.prune()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
@@ -189,15 +171,10 @@ class VisitTraining:
         """Whether the visit has had all its steps or time, or its block has outgrown the device."""
         run, active = self.run, self.run.active
         out_of_time = run.progress >= min(active.until, 1.0)
-        return active.done >= active.steps or out_of_time or self._is_warm or self.block.has_outgrown
-
-    @property
-    def _is_warm(self) -> bool:
-        run, active = self.run, self.run.active
-        if not active.is_whole:
-            return False
-        uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
-        return warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
+        if active.is_whole:
+            uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
+            out_of_time |= warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
+        return active.done >= active.steps or out_of_time or self.block.has_outgrown
 
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
@@ -205,7 +182,8 @@ class VisitTraining:
         if not active.is_all and not self.block.is_new:
             self.block.prune()
         self.block.end_visit(counts=not active.is_whole)
-        state = self.run.health.end_visit(self.block.detached)
+        state = self.block.detached()
+        self.run.health.end_visit()
         self.layers = None
         return state
 
@@ -213,9 +191,7 @@ class VisitTraining:
 
     def whole(self, view: int) -> Sample:
         """All that a view shows of the block in this visit."""
-        run, active = self.run, self.run.active
-        seen, crop = run.views_at(run.reduction)[view], active.geometry.crops[view]
-        return self._sample_of(seen, crop, 0, run.state.step)
+        return self._sample(view, 0, in_part=False)
 
     @property
     def degree(self) -> int:
@@ -231,19 +207,17 @@ class VisitTraining:
             return tuple(endless_order(views, place, seed) for place in places)
         return self._order[places.start : places.stop]
 
-    def _sample(self, view: int, place: int, step: int) -> Sample:
+    def _sample(self, view: int, place: int, *, in_part: bool = True) -> Sample:
         """What is drawn at one place of a step: all that a view shows of the block, or a part."""
-        seen, active = self.run.views_at(self.run.reduction)[view], self.run.active
+        run, active, step = self.run, self.run.active, self.run.state.step
+        seen = run.views_at(run.reduction)[view]
+        if self.layers and not self.layers.shows(seen):
+            raise RuntimeError(f"View {view} has moved since its layers were drawn.")
         whole = seen.full if active.is_all else active.geometry.crops[view]
-        crop = part_to_draw(self.run.config, whole, step, place)
-        sample = self._sample_of(seen, crop, place, step)
-        return replace(sample, share=crop.pixels / whole.pixels)
-
-    def _sample_of(self, view: View, crop: Crop, place: int, step: int) -> Sample:
-        if self.layers and not self.layers.shows(view):
-            raise RuntimeError(f"View {view.index} has moved since its layers were drawn.")
-        layers, window = self.layers.around(view.index, crop) if self.layers else (None, None)
-        return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
+        crop = part_to_draw(run.config, whole, step, place) if in_part else whole
+        layers, window = self.layers.around(view, crop) if self.layers else (None, None)
+        behind = self._backgrounds.at(step, place)
+        return Sample(seen, crop, layers, window, behind, share=crop.pixels / whole.pixels)
 
     def _draw(self, samples: Sequence[Sample]) -> Rendered:
         run, gaussians = self.run, active_gaussians(self.run.params)
@@ -252,7 +226,7 @@ class VisitTraining:
             [sample.shot for sample in samples],
             sh_degree=min(self.degree, gaussians.sh_degree),  # by time, it may have risen since `next_batch`
             antialiased=run.config.antialiased,
-            blend_weights=run.density.wants_weights,
+            blend_weights=run.density.config.prunes,
             residual_sums=run.density.asks(run.share, first=self.block.clocks.visits == 0),
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
@@ -263,7 +237,7 @@ class VisitTraining:
     def _pictures(
         self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]
     ) -> tuple[Tensor, ...]:
-        blend_weights = self.run.density.wants_weights
+        blend_weights = self.run.density.config.prunes
         if all(light is None for light in lights):
             found = pictures_of(rasters, [sample.frame(blend_weights) for sample in samples])
             if found is not None:

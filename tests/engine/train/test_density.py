@@ -1,27 +1,27 @@
-"""Growing and pruning, on a block's own clock."""
+"""When a block grows, by its own clock and by the run's, and how."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, nothing_active
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density import control as control_module
-from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import (
+    LEAST_REFINEMENTS,
+    USUAL_REFINEMENTS,
+    DensityClock,
+    DensityConfig,
+    DensityControl,
+)
 from abcd_ns.engine.train.density.worth import WORTH
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from abcd_ns.errors import UserError
-from tests.reference.scenes import random_gaussians
+from abcd_ns.engine.types import PARAM_NAMES
+from tests.reference.scenes import activated, random_gaussians
 
 VIEWS = 5
-
-
-def active(gaussians: Gaussians):
-    params, optimizers = nothing_active(gaussians.sh_degree)
-    attach(BlockState.fresh(gaussians), params, optimizers)
-    return params, optimizers
 
 
 def statistics(*gains: float) -> dict[str, torch.Tensor]:
@@ -43,7 +43,7 @@ def clock(**changes) -> DensityClock:
 def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     monkeypatch.setattr(control_module, "MOST_NEW", 1.0)
     gaussians = random_gaussians(8, size=0.001)
-    params, optimizers = active(gaussians)
+    params, optimizers = activated(gaussians)
     control = DensityControl(DensityConfig(split_pixels=6.0, cull_alpha_thresh=0.0))
     growth = statistics(*[7.0] * 5, *[5.0] * 3)
     growth, refined = control.after_step(params, optimizers, growth, (), (), clock())
@@ -58,7 +58,7 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
 
 @pytest.mark.parametrize(("room", "added"), [(None, 30), (200, 30), (12, 12), (0, 0)])
 def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
-    params, optimizers = active(random_gaussians(300, size=0.001))
+    params, optimizers = activated(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
     before = params["means"].detach().clone()
     control.after_step(params, optimizers, statistics(*range(100, 400)), (), (), clock(room=room))
@@ -66,35 +66,105 @@ def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
     assert torch.equal(params["means"][: 300 - added], before[: 300 - added])  # the best are the last
 
 
-def test_without_room_nothing_is_added_but_the_transparent_go():
+def test_without_room_nothing_is_added_but_the_transparent_go_and_the_large_stay():
+    """Sky and far background are large; what is so for every camera is held back by angle."""
     gaussians = random_gaussians(8, size=0.001)
     gaussians.opacities[:] = 2.0
     gaussians.opacities[:3] = -8.0
-    params, optimizers = active(gaussians)
+    gaussians.scales[5] = math.log(5.0)
+    params, optimizers = activated(gaussians)
     control = DensityControl(DensityConfig())
     control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock(room=0))
     assert torch.equal(params["means"], gaussians.means[3:])
-
-
-def test_what_is_large_stays():
-    """Sky and far background are; what is large for every camera is held back by angle."""
-    gaussians = random_gaussians(8, size=0.01)
-    gaussians.opacities[:] = 3.0
-    gaussians.scales[0] = math.log(5.0)
-    control = DensityControl(DensityConfig(refine_every=10))
-    params, optimizers = active(gaussians)
-    control.after_step(params, optimizers, statistics(*[0.0] * 8), (), (), clock(steps=510))
-    assert len(params["means"]) == 8
-
-
-@pytest.mark.parametrize("option", [{"antialiased": True}, {"poses": "SO3xR3"}])
-def test_what_gsplats_surfels_lack_is_refused(option):
-    TrainingConfig(**option).check()
-    with pytest.raises(UserError, match=f"{next(iter(option))} is for 3dgs"):
-        TrainingConfig(primitive="2dgs", **option).check()
 
 
 def test_clocks_of_older_versions_are_read():
     """They counted resets, too."""
     meta = {"clocks": {**vars(Clocks(steps=2, visits=1)), "resets": 3}}
     assert BlockState.clocks_of(meta) == Clocks(steps=2, visits=1)
+
+
+def refinements(run: int, views: int, taken: int = 1, **changes) -> list[int]:
+    """Views after which a run that draws so many is refined."""
+    control, found = DensityControl(DensityConfig(**changes)), [0]
+    for steps in range(taken, run + 1, taken):
+        at = clock(steps=steps, progress=steps / run, views=views, taken=taken, refined=found[-1])
+        found += [steps] if control.is_due(at) else []
+    return found[1:]
+
+
+@given(st.integers(400, 30_000), st.integers(1, 15_000), st.integers(1, 4))
+@settings(max_examples=20, deadline=None)
+def test_every_run_is_refined_about_4_to_150_times_and_20_where_all_views_were_drawn(run, views, taken):
+    found = refinements(run, views, taken)
+    assert LEAST_REFINEMENTS - 1 <= len(found) <= 150
+    all_views_drawn = (0.5 - 1 / 60) * run / views
+    assert len(found) >= 0.7 * min(USUAL_REFINEMENTS, all_views_drawn) - 1
+
+
+@pytest.mark.parametrize(("run", "views"), [(7000, 147), (7000, 300), (30_000, 700)])
+def test_a_block_is_refined_whenever_its_views_were_drawn(run, views):
+    found = refinements(run, views)
+    assert {b - a for a, b in pairwise(found)} == {views}
+
+
+def test_a_number_of_views_between_refinements_may_be_given():
+    assert {b - a for a, b in pairwise(refinements(3000, 20, refine_every=100))} == {100}
+    assert {b - a for a, b in pairwise(refinements(3000, 130, refine_every=100))} == {130}
+
+
+@pytest.mark.parametrize(("progress", "expected"), [(0.0, False), (0.1, True), (0.49, True), (0.5, False)])
+def test_refinement_keeps_to_its_share_of_the_run(progress, expected):
+    assert DensityControl(DensityConfig()).is_due(clock(progress=progress)) is expected
+
+
+@pytest.mark.parametrize("steps", [17, 32, 39, 64])
+def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
+    """It was refined in the warm-up, just now perhaps; later visits count from the one before."""
+    control, batch = DensityControl(DensityConfig()), 4
+
+    def due(first: bool) -> list[int]:
+        drawn = batch * steps
+        options = {"refined": 1000, "taken": batch, "views": drawn, "visit": drawn}
+        each = (
+            clock(steps=1000 + batch * k, spent=k / steps, first=first, **options)
+            for k in range(1, steps + 1)
+        )
+        return [k for k, at in enumerate(each, start=1) if control.is_due(at)]
+
+    assert due(first=True)
+    assert not due(first=False)
+
+
+def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_it_missed():
+    control = DensityControl(DensityConfig(refine_every=30))
+    late = {"views": 20, "taken": 4, "refined": 100, "spent": 0.6}
+    assert not control.is_due(clock(steps=128, **{**late, "spent": 0.1}))
+    assert control.is_due(clock(steps=132, **{**late, "spent": 0.1}))
+    assert not control.is_due(clock(steps=132, **late))
+    assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
+    assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))
+
+
+def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
+    late = {"progress": 0.6, "refined": 0, "spent": 0.1}
+    control = DensityControl(DensityConfig())
+    assert control.is_due(clock(first=True, **late))
+    assert not control.is_due(clock(first=True, **{**late, "progress": 0.71}))
+    assert not control.is_due(clock(**late))
+    assert not control.is_due(clock(first=True, **{**late, "spent": 0.6}))
+    never = DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0))
+    assert not never.is_due(clock(first=True, **late))
+
+
+def test_a_block_is_refined_less_often_where_a_picture_shows_little_of_it():
+    """As often for each Gaussian; but no less than four times in a run, and never where a number is given."""
+
+    def every(seen: float, run: int = 20_000, **changes) -> int:
+        taken, control = range(1000, run), DensityControl(DensityConfig(**changes))
+        at = (clock(steps=n, progress=n / run, refined=999, views=5) for n in taken)
+        return next(each.steps - each.refined for each in at if control.is_due(each, seen))
+
+    assert [every(seen) for seen in (1.0, 0.4, 0.2, 0.1)] == [100, 100, 200, 400]
+    assert every(0.1, refine_every=30) == 30
+    assert every(0.001) == every(0.0) == int((0.5 - 1 / 60) * 20_000 / LEAST_REFINEMENTS)

@@ -12,6 +12,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import final_pruning
 from abcd_ns.engine.train.step.final_pruning import FinalPruning, _Probe, random_signs
+from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
@@ -70,7 +71,7 @@ def at_end(told) -> PrunedAtEnd:
 @pytest.mark.parametrize("options", [{}, {"blocks": 4, "pass_gaussians": 1}, {"primitive": "2dgs"}])
 def test_as_many_go_as_training_views_can_spare(complete, views, photos, monkeypatch, options):
     with monkeypatch.context() as patched:
-        patched.setattr(FinalPruning, "is_wanted", False)
+        patched.setattr(FinalPruning, "run", lambda _: None)
         all_of_it, _ = complete("all", **options)
     coordinator, told = complete("pruned", **options)
     found = at_end(told)
@@ -178,7 +179,7 @@ def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian
     """In the mean over many signs, of a Gaussian at a time."""
     coordinator, _ = complete(steps=5, density=replace(STILL, min_contribution=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, views[0]
-    whole = coordinator._final_pruning._whole
+    whole = WholeViews(coordinator.run, lambda _: None)
     probed, signs = _Probe(), random_signs(0)
     pictures = whole.pictures([view], ChangedScene(coordinator.scene, probed.with_leaf))
     times = 400

@@ -9,19 +9,17 @@ from gsplat.utils import normalized_quat_to_rotmat
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, nothing_active
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.train.density.growing import chosen, split_gaussians
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.engine.space.test_tree import SEEDS
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import activated, random_gaussians, ring_of_views
 
 
 def after_split(gaussians: Gaussians, which, axis=None, growth=None):
     """The Gaussians afterwards, and their statistics."""
-    params, optimizers = nothing_active(gaussians.sh_degree)
-    attach(BlockState.fresh(gaussians), params, optimizers)
+    params, optimizers = activated(gaussians)
     axis = gaussians.scales.argmax(dim=1) if axis is None else axis
     found = split_gaussians(params, optimizers, growth or {}, torch.as_tensor(which), axis)
     for name in PARAM_NAMES:

@@ -9,11 +9,9 @@ import torch
 from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.health import health_rules
-from abcd_ns.engine.train.health.health import Health
-from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
+from abcd_ns.engine.train.health import OVERSIZED_ANGLE, Health, stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
-from abcd_ns.engine.train.memory import OutOfRoomError, active_bytes, check_room
+from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_room, parameter_bytes
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -112,7 +110,7 @@ def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make
     coordinator.health.shrink_oversized(views, torch.arange(len(scales)) == 2)
     assert [(event.what, event.count) for event in told] == [("oversized", 1)]
     nearest = min(float((means[0] - view.center).norm()) for view in views)
-    limit = health_rules.OVERSIZED_ANGLE * nearest
+    limit = OVERSIZED_ANGLE * nearest
     assert scales[0].tolist() == pytest.approx([math.log(limit), -3.0, math.log(limit)])
     assert float(scales[1].max()) == pytest.approx(math.log(100.0))
     assert torch.equal(scales[2:], kept)
@@ -133,7 +131,7 @@ def test_oversized_gaussians_shrink_before_their_block_is_trained_and_none_grows
     train(coordinator, photos)
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
-    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.OVERSIZED_ANGLE
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * OVERSIZED_ANGLE
     assert not told
     states = [coordinator.scene.state(block) for block in range(blocks)]
     assert all(LARGEST not in state.growth for state in states)
@@ -198,7 +196,9 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
-    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: active_bytes(30, 1))
+    monkeypatch.setattr(
+        "abcd_ns.engine.train.memory.free_bytes", lambda _: 30 * ACTIVE_COPIES * parameter_bytes(1)
+    )
     coordinator = make(blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)

@@ -7,7 +7,6 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
-from abcd_ns.engine.train.coordinator import influence_on
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
@@ -186,7 +185,8 @@ def test_a_block_that_a_wall_hides_is_neither_read_nor_drawn(tmp_path, monkeypat
         tmp_path, Gaussians.cat([wall, before, behind]), views, blocks=8, window_weight=0.0
     )
     hidden = {block for block in range(8) if float(run.scene.gaussians(block).means[:, 0].max()) < -5}
-    known = influence_on(run.run, whole_scene(run), run.scene.tree, [0, 1])
+    whole = whole_scene(run)
+    known = influence(whole, run.scene.tree.assign(whole.means), views, run.run.rasterizer)
     run.state.influence = {block: known.get(block, {}) for block in range(8)}
     read, drawn = set[int](), run.scene.drawn
     monkeypatch.setattr(run.scene, "drawn", lambda block, *more: read.add(block) or drawn(block, *more))

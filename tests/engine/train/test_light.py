@@ -1,5 +1,7 @@
 """Photos that were taken in different light: a transform of each finished picture makes good for it."""
 
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import given
@@ -12,11 +14,9 @@ from tests.reference.scenes import (
     STILL,
     Photos,
     assert_resumes,
-    make_coordinator,
     random_gaussians,
     ring_of_views,
     stop,
-    training_config,
     whole_scene,
 )
 
@@ -44,14 +44,9 @@ def drifting(ring):
 
 
 @pytest.fixture
-def make(tmp_path, ring):
-    """Makes coordinators that begin with the truth, each in a folder of its own or in an earlier one's."""
-
-    def made(name: str = "run", **options):
-        (tmp_path / name).mkdir(exist_ok=True)
-        return make_coordinator(tmp_path / name, TRUTH, ring, **{"density": STILL, **options})
-
-    return made
+def make(make, ring):
+    """Makes runs that begin with the truth."""
+    return partial(make, start=TRUTH, views=ring, density=STILL)
 
 
 @pytest.fixture
@@ -98,7 +93,8 @@ def test_layers_and_cuts_are_those_of_a_run_without_it(make):
         if kind == "affine":
             made.run.light._changes += 0.1 * torch.randn(6, 3, 4, generator=torch.Generator().manual_seed(3))
         rendered = made.render(batch)
-        drawn.append(list(zip(batch.samples, rendered.pictures, rendered.transmittances, strict=True)))
+        left = [raster.transmittance for raster in rendered.rasters]
+        drawn.append(list(zip(batch.samples, rendered.pictures, left, strict=True)))
     for (one, plain, alone), (other, changed, same) in zip(*drawn, strict=True):
         assert one.crop == other.crop
         assert torch.equal(alone, same)
@@ -134,8 +130,3 @@ def test_a_run_that_stops_goes_on_with_its_transforms_and_moments(make, drifting
     whole, again = assert_resumes(make, drifting, 14, blocks=4, steps=30, light="affine")
     assert torch.equal(transforms(again.run.light), transforms(whole.run.light))
     assert not torch.allclose(transforms(whole.run.light), IDENTITY, atol=1e-3)
-
-
-def test_joint_training_over_blocks_refuses_it():
-    with pytest.raises(UserError, match=r"training\.light"):
-        training_config(exact=True, light="affine").check()

@@ -8,7 +8,7 @@ import torch
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.health.health_rules import unsound
+from abcd_ns.engine.train.health import unsound
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene

@@ -10,7 +10,8 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+from abcd_ns.errors import UserError
+from tests.reference.scenes import make_coordinator, random_gaussians, training_config, whole_scene
 
 GROWING = {"refine_start": 0.0, "refine_every": 5, "split_pixels": 1.0, "min_contribution": 2.0}
 OTHERS = {
@@ -81,6 +82,22 @@ def test_an_option_of_training_changes_what_is_learnt(name, learnt, usual):
 @pytest.mark.parametrize("name", OTHERS_OF_DENSITY)
 def test_an_option_of_density_changes_what_is_learnt(name, learnt, usual):
     assert learnt({**GROWING, name: OTHERS_OF_DENSITY[name]}) != usual
+
+
+@pytest.mark.parametrize(
+    ("option", "others"),
+    [
+        ({"antialiased": True}, {"primitive": "2dgs"}),
+        ({"poses": "SO3xR3"}, {"primitive": "2dgs"}),
+        ({"poses": "SO3xR3"}, {"exact": True}),
+        ({"poses": "SO3xR3"}, {"overlap": 0.1, "layers": False, "migrate": False}),
+        ({"light": "affine"}, {"exact": True}),
+    ],
+)
+def test_what_contradicts_a_method_or_its_primitive_is_refused(option, others):
+    training_config(**option).check()
+    with pytest.raises(UserError, match=f"training.{next(iter(option))} is for "):
+        training_config(**option, **others).check()
 
 
 def test_there_are_twenty_and_all_are_looked_at():

@@ -1,6 +1,7 @@
 """Photos under poses that are off: they are refined by whole pictures, and nothing stale is drawn."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -13,16 +14,7 @@ from abcd_ns.engine.train.capture.poses import laid_over, turned
 from abcd_ns.engine.train.layer_source import layers_of_visit
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.errors import UserError
-from tests.reference.scenes import (
-    STILL,
-    Photos,
-    assert_resumes,
-    make_coordinator,
-    random_gaussians,
-    ring_of_views,
-    training_config,
-)
+from tests.reference.scenes import STILL, Photos, assert_resumes, random_gaussians, ring_of_views
 
 TRUTH = random_gaussians(150, seed=7, size=0.12)
 RING = ring_of_views(6)
@@ -49,20 +41,15 @@ def photos():
 
 
 @pytest.fixture
-def make(tmp_path, photos, monkeypatch):
-    """Makes coordinators that begin with the truth, under noisy poses, which are refined soon."""
+def make(make, photos, monkeypatch):
+    """Makes runs that begin with the truth, under noisy poses, which are refined soon."""
     monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
 
     def target(sample):
         return sample.reduced(photos(sample.view.index, sample.source)), None
 
-    def made(name: str = "run", views=None, **options):
-        (tmp_path / name).mkdir(exist_ok=True)
-        options = {"density": STILL, "poses": "SO3xR3", "background": "black", **options}
-        views = shaken(RING) if views is None else views
-        return make_coordinator(tmp_path / name, TRUTH, views, target=target, **options)
-
-    return made
+    options = {"density": STILL, "poses": "SO3xR3", "background": "black", "target": target}
+    return partial(make, start=TRUTH, views=shaken(RING), **options)
 
 
 def off_by(views, others) -> float:
@@ -146,12 +133,5 @@ def test_a_view_that_moved_is_not_drawn_with_layers_from_where_it_was(make):
     made.next_batch()
     view = made.state.active.views[0]
     made.run.poses.move({view: torch.full((6,), 0.01, dtype=torch.float64)})
-    made.run.take_poses()
     with pytest.raises(RuntimeError, match="moved"):
         made.next_batch()
-
-
-@pytest.mark.parametrize("recipe", [{"exact": True}, {"overlap": 0.1, "layers": False, "migrate": False}])
-def test_methods_without_whole_pictures_refuse(recipe):
-    with pytest.raises(UserError, match=r"training\.poses"):
-        training_config(poses="SO3xR3", **recipe).check()

@@ -9,8 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.events import Repaired
-from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import attach, nothing_active
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import weights
@@ -18,7 +16,7 @@ from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen, veils
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
-from tests.reference.scenes import listen, random_gaussians, whole_scene
+from tests.reference.scenes import activated, listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 """Nothing grows, and the minimum is the full one from the beginning."""
@@ -52,9 +50,7 @@ def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_minimum(
             assert goes == (looks >= views and per_view * views < min_contribution)
 
 
-@given(
-    whole=st.integers(1, 5000), block=st.integers(1, 5000), before=st.integers(1, 20), now=st.integers(1, 9)
-)
+@given(st.integers(1, 5000), st.integers(1, 5000), st.integers(1, 20), st.integers(1, 9))
 def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, now):
     """A Gaussian that fills 20 px in `block` of a scene's `whole` views, and none in the others."""
     whole, total = max(whole, block), torch.zeros(2)
@@ -66,8 +62,6 @@ def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, 
         total += looks * torch.cat((one["weight"], one["passes"]))
     growth = {"weight": total[:1], "passes": total[1:]}
     torch.testing.assert_close(contributions(growth), torch.tensor([20.0]), rtol=1e-4, atol=0.0)
-    assert bool(contributions(growth) <= 20.1)
-    assert not bool(contributions(growth) <= 19.9)
 
 
 @given(
@@ -109,10 +103,8 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos):
     assert sum(record.pruned for record in coordinator.state.health.values()) == gone
     assert HIDDEN / 2 < gone < 2 * HIDDEN
     assert float(left.means[:, 2].max()) < 40
-    contributions = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(
-        dim=0
-    )
-    assert float((contributions > 0.5).float().mean()) > 0.9
+    shown = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views])
+    assert float((shown.sum(dim=0) > 0.5).float().mean()) > 0.9
 
 
 def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_prunes(make, photos):
@@ -162,8 +154,7 @@ def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, v
 def test_a_cloud_before_cameras_is_pruned_and_what_is_as_faint_but_small_stays(progress, gone):
     opacity, contributions = [0.02, 0.07, 0.02, 0.07, *[0.9] * 5], [90.0, 90.0, 9.0, 9.0, 90.0, *[9.0] * 4]
     gaussians = replace(random_gaussians(9), opacities=torch.tensor(opacity).logit()[:, None])
-    params, optimizers = nothing_active(gaussians.sh_degree)
-    attach(BlockState.fresh(gaussians), params, optimizers)
+    params, optimizers = activated(gaussians)
     growth = {**statistics(contributions, [1.0] * 9), "count": torch.ones(9)}
     DensityControl(DensityConfig(min_contribution=1.0)).prune(params, optimizers, growth, progress)
     left = [each for each in range(9) if each not in gone]

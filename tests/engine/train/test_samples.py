@@ -12,8 +12,7 @@ from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import reduction_at
-from abcd_ns.engine.train.step.batch import Sample, part_to_draw
-from abcd_ns.engine.train.step.cutouts import ALIGN, random_part
+from abcd_ns.engine.train.step.batch import ALIGN, Sample, part_to_draw, random_part
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, View
 from tests.reference.rasterizer_scenes import project
@@ -54,13 +53,11 @@ def test_parts_lie_in_the_crop_keep_to_the_limit_and_meet_at_whole_tiles(crop, m
     assert inside.x + part.width <= crop.width
     assert inside.y + part.height <= crop.height
     assert part.pixels <= max(most, ALIGN * ALIGN)
-    for edge, own in ((part.x, crop.x), (part.y, crop.y)):
-        assert edge == own or edge % ALIGN == 0
-    for end, own in (
-        (part.x + part.width, crop.x + crop.width),
-        (part.y + part.height, crop.y + crop.height),
-    ):
-        assert end == own or end % ALIGN == 0
+    columns, rows = (part.x, part.x + part.width), (part.y, part.y + part.height)
+    for edge in columns:
+        assert edge in (crop.x, crop.x + crop.width) or edge % ALIGN == 0
+    for edge in rows:
+        assert edge in (crop.y, crop.y + crop.height) or edge % ALIGN == 0
 
 
 @given(CROPS, st.integers(300_000, 3_000_000), st.integers())
@@ -151,10 +148,8 @@ def test_pictures_grow_by_share_and_never_become_too_small():
 
 @pytest.mark.parametrize("by", [1, 2, 4])
 def test_a_reduced_camera_sees_the_same_in_larger_pixels(by):
-    (view,), gaussians = (
-        ring_of_views(1, width=50, dtype=torch.float64),
-        random_gaussians(20).to(torch.float64),
-    )
+    (view,) = ring_of_views(1, width=50, dtype=torch.float64)
+    gaussians = random_gaussians(20).to(torch.float64)
     small = view.reduced(by)
     assert (small.width, small.height, small.reduction) == (50 // by, 36 // by, by)
     found, full = project(gaussians, small), project(gaussians, view)
@@ -167,12 +162,7 @@ def test_a_reduced_photo_is_the_mean_of_its_squares():
     sample = sample_of(view.reduced(4), Crop(2, 1, 5, 6))
     assert sample.source == Crop(8, 4, 20, 24)
     photo = torch.rand(24, 20, 3)
-    expected = torch.stack(
-        [
-            torch.stack([photo[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].mean(dim=(0, 1)) for x in range(5)])
-            for y in range(6)
-        ]
-    )
+    expected = photo.view(6, 4, 5, 4, 3).mean(dim=(1, 3))
     torch.testing.assert_close(sample.reduced(photo), expected)
 
 

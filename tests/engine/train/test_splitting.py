@@ -7,9 +7,9 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.density import control
-from abcd_ns.engine.train.density.splitting import FULL, cut_stored, split_full
+from abcd_ns.engine.train.density.splitting import cut_stored, split_full
 from abcd_ns.engine.train.health_record import BlockHealth, standing
-from abcd_ns.engine.train.recipe import Limits
+from abcd_ns.engine.train.recipe import FULL, Limits
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -50,8 +50,9 @@ def test_what_cannot_be_parted_is_left_as_it_is():
     assert split_full(tree, deferred, Limits(10)) == (tree, deferred, {})  # it is no block
 
 
-def test_a_part_is_visited_next_to_the_block_it_came_from():
+def test_a_part_is_visited_next_to_the_block_it_came_from_and_has_had_its_visits():
     state = RunState(queue=[VisitPlan(0, 5), VisitPlan(1, 7)], views={0: 3, 1: 4}, influence={0: {2: 0.5}})
+    state.health[0] = BlockHealth(visits=3, pruned=7)
     state.inherit(2, 0)
     state.inherit(3, 1)
     assert state.queue == [VisitPlan(0, 5), VisitPlan(2, 5), VisitPlan(1, 7), VisitPlan(3, 7)]
@@ -59,12 +60,6 @@ def test_a_part_is_visited_next_to_the_block_it_came_from():
     assert state.influence == {0: {2: 0.5}, 2: {2: 0.5}}
     state.influence[2][2] = 0.1
     assert state.influence[0][2] == 0.5
-
-
-def test_a_part_has_had_the_visits_of_the_block_it_came_from():
-    state = RunState(health={0: BlockHealth(visits=3, pruned=7)})
-    state.inherit(2, 0)
-    state.inherit(3, 1)
     assert state.health.keys() == {0, 2}
     assert state.health[2] == BlockHealth(visits=3)  # what was pruned is told once
     assert standing(2, state.health[2], {}) == "trained"

@@ -1,7 +1,6 @@
 """The light each photo was taken in: a colour transform of its finished picture, found while training.
 
-F, the active block, B and the background are composited first. So no layer hangs on a transform, and all stay
-valid whatever becomes of it. Transforms belong to the run and not to a block: of each photo there is one.
+F, the active block, B and the background are composited first, so that no layer depends on a transform.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,18 +24,16 @@ LAST_RATE = 0.03
 BETAS = (0.9, 0.999)
 AMONG_OTHERS = 0.5
 """Share of the rate where a visit shows only a part of each picture."""
-TABLE_BYTES = 1 << 18
-"""Size of one table on disk, about, moments included."""
+TABLE_ROWS = 1820
+"""Of one table on disk, which is a quarter of a MiB then, moments included."""
 
 
 class Light:
     """A transform for each view, [3, 4], by which colour c becomes M c + o. All begin as the identity, which
-    their mean over the views always is: otherwise the scene's colours would drift, and the transforms with
-    them.
+    is always their mean: otherwise the scene's colours would drift, and the transforms with them.
 
     Args:
         kind: `exposure` leaves a gain for each channel, `affine` everything free.
-        views: their indices.
         device: where pictures are.
     """
 
@@ -60,13 +57,8 @@ class Light:
 
     @torch.no_grad()
     def step(self, gradients: Gradients, damping: float = 1.0) -> None:
-        """Take a step of Adam (Kingma and Ba 2015, algorithm 1), for each view that the step shows its own:
-        the others keep their transforms and moments.
-
-        Args:
-            gradients: of all pictures of the step; those that are no numbers count as zero.
-            damping: share of the rates.
-        """
+        """Take a step of Adam (Kingma and Ba 2015, algorithm 1) with damped rates, for each view that is
+        shown its own: the others keep their transforms and moments. What is no number counts as zero."""
         if not gradients:
             return
         of_views: dict[int, Tensor] = {}
@@ -90,22 +82,18 @@ class Light:
     # -- persist and restore -------------------------------------------------------------------------
 
     def changed(self) -> dict[str, Packed]:
-        """All that has changed since the last call, by the names under which it is to be kept; shares no
-        memory."""
-        parts = {row // self._together for row in self._stepped}
+        """All that has changed since the last call, by the names to keep it under; shares no memory."""
+        parts, tables = {row // TABLE_ROWS for row in self._stepped}, {}
         self._stepped.clear()
-        return {_name(part): self._table(part) for part in sorted(parts | {0})} if parts else {}
+        for part in sorted(parts | {0}) if parts else ():
+            tensors = {name: value.to("cpu", copy=True) for name, value in self._tensors(part).items()}
+            tables[_name(part)] = Packed(tensors, {"kind": self.kind})
+        return tables
 
     def restore(self, table: Callable[[str], Packed | None]) -> None:
-        """Stand where all that `changed` ever gave was kept.
-
-        Args:
-            table: finds it by name; None for nothing.
-
-        Raises:
-            UserError: these are transforms of another kind.
-        """
-        for part in range(-(-len(self._rows) // self._together)):
+        """Stand where all that `changed` ever gave was kept, which `table` finds by name; a UserError if
+        these are transforms of another kind."""
+        for part in range(-(-len(self._rows) // TABLE_ROWS)):
             kept = table(_name(part))
             if kept is None:
                 continue
@@ -117,28 +105,15 @@ class Light:
             for name, value in self._tensors(part).items():
                 value.copy_(kept.tensors[name])
 
-    @property
-    def _together(self) -> int:
-        """Rows of a table."""
-        return max(1, TABLE_BYTES // (self._changes[:1].nbytes * 3))
-
-    def _table(self, part: int) -> Packed:
-        tensors = {name: value.to("cpu", copy=True) for name, value in self._tensors(part).items()}
-        return Packed(tensors, {"kind": self.kind})
-
     def _tensors(self, part: int) -> dict[str, Tensor]:
         """What is kept together, itself. The first has the sum, too."""
-        rows = slice(part * self._together, (part + 1) * self._together)
+        rows = slice(part * TABLE_ROWS, (part + 1) * TABLE_ROWS)
         found = {name: getattr(self, f"_{name}")[rows] for name in ("changes", "first", "second", "uses")}
         return found | ({"sum": self._sum} if part == 0 else {})
 
 
 class HeldLight:
-    """Transforms that somebody else found, and which stay as they are.
-
-    Args:
-        transforms: by view.
-    """
+    """Transforms by view that somebody else found, and which stay as they are."""
 
     def __init__(self, transforms: Mapping[int, Tensor], device: torch.device) -> None:
         self._transforms = {view: transform.to(device) for view, transform in transforms.items()}

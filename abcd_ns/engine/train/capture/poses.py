@@ -5,8 +5,8 @@ optimizer has it). All poses together may not be turned, moved or scaled: the sc
 looks at it from elsewhere, held-out views first of all, would look past it.
 """
 
-import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -28,48 +28,47 @@ LEAST_OPACITY = 0.1
 
 
 class Poses:
-    """World-to-camera matrices of a run's views.
-
-    Args:
-        views: as they were given.
-    """
+    """A run's views, as they were given, and where they stand by now."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        self._given = {view.index: view.viewmat for view in views}
-        self._refined: dict[int, Tensor] = {}
+        self._given = {view.index: view for view in views}
+        self.views = self._given
+        """By index; another dictionary whenever they have moved."""
 
     @property
     def refined(self) -> dict[int, Float[Tensor, "4 4"]]:
-        """By view; empty where all are as they were given."""
-        return self._refined
-
-    def of(self, view: int) -> Float[Tensor, "4 4"]:
-        """The pose of a view by now."""
-        return self._refined.get(view, self._given[view])
+        """World-to-camera matrices by view; empty where all are as they were given."""
+        moved = () if self.views is self._given else self.views.items()
+        return {index: view.viewmat for index, view in moved}
 
     def move(self, steps: Mapping[int, Float64[Tensor, "6"]]) -> None:
         """Take a step for each of these views, see `turned`; then all are laid over those that were given."""
-        moved = {view: turned(self.of(view).double(), step) for view, step in steps.items()}
         views = sorted(self._given)
-        given = torch.stack([self._given[view].double() for view in views])
-        now = torch.stack([moved.get(view, self.of(view).double()) for view in views])
-        laid = laid_over(now, given)
-        self._refined = {view: pose.to(self._given[view]) for view, pose in zip(views, laid, strict=True)}
+        given, now = ([some[view].viewmat.double() for view in views] for some in (self._given, self.views))
+        for place, view in enumerate(views):
+            if view in steps:
+                now[place] = turned(now[place], steps[view])
+        laid = laid_over(torch.stack(now), torch.stack(given))
+        self._place(dict(zip(views, laid, strict=True)))
 
-    def to_json(self) -> dict[str, str]:
+    def packed(self) -> dict[int, bytes]:
         """Those that are refined, bit for bit."""
-        return {
-            str(view): base64.b64encode(pose.cpu().contiguous().numpy().tobytes()).decode()
-            for view, pose in self._refined.items()
-        }
+        return {view: pose.cpu().contiguous().numpy().tobytes() for view, pose in self.refined.items()}
 
-    def restore(self, data: Mapping[str, str]) -> None:
-        """Stand where `to_json` was called."""
-        self._refined = {}
-        for view, text in data.items():
-            like = self._given[int(view)]
-            pose = torch.frombuffer(bytearray(base64.b64decode(text)), dtype=like.dtype)
-            self._refined[int(view)] = pose.view_as(like)
+    def restore(self, packed: Mapping[int, bytes]) -> None:
+        """Stand where `packed` was called."""
+        moved = {}
+        for view, pose in packed.items():
+            like = self._given[view].viewmat
+            moved[view] = torch.frombuffer(bytearray(pose), dtype=like.dtype).view_as(like)
+        self._place(moved)
+
+    def _place(self, poses: Mapping[int, Float[Tensor, "4 4"]]) -> None:
+        """Views stand as these matrices say, which are those of all views, or none."""
+        moved = dict(self._given)
+        for view, pose in poses.items():
+            moved[view] = replace(moved[view], viewmat=pose.to(moved[view].viewmat))
+        self.views = moved if poses else self._given
 
 
 def turned(viewmat: Float64[Tensor, "4 4"], step: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
@@ -100,9 +99,6 @@ def step_for(
 
     The gradient is exact. For the matrix, pixels move as their depth says and bring their colour along (Lucas
     and Kanade 1981): no drawing is needed for it.
-
-    Args:
-        weight: of each pixel and channel.
     """
     flow = _flow(view, picture)
     across, down = _slopes(picture.color)

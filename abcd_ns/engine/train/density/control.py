@@ -5,7 +5,7 @@ a schedule in absolute steps of one global run. Here it is in shares of the run 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -42,8 +42,6 @@ MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MANY_VIEWS = 25
 """Of fewer, what a Gaussian contributes sums up to less: the minimum is in proportion to them."""
-
-
 Infos = tuple[dict[str, Any], ...]
 """gsplat's `info` of one or more drawings."""
 
@@ -75,8 +73,8 @@ class DensityConfig:
     """Opacity under which a Gaussian is pruned."""
 
     @property
-    def prunes_at_end(self) -> bool:
-        """Whether a final pruning follows the run."""
+    def prunes(self) -> bool:
+        """Whether Gaussians go that contribute too little; the rasterizer must leave `weights` then."""
         return self.min_contribution > 0 and self.strategy != "off"
 
     def for_views(self, count: int) -> "DensityConfig":
@@ -109,16 +107,9 @@ class DensityClock:
     """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
     """Share of the visit that is done; 0 in the warm-up and where there are no other blocks."""
-    seen: float = 1.0
-    """Share of the block's Gaussians that a picture shows, in the mean."""
     visit: int | None = None
     """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
     show it."""
-
-    @property
-    def pace(self) -> float:
-        """Views that the whole run would draw, if it went on as it has so far."""
-        return self.steps / max(self.progress, 1e-9)
 
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
@@ -131,45 +122,26 @@ class DensityControl:
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
         self.config, self._axes = config, primitive.axes
 
-    @property
-    def wants_weights(self) -> bool:
-        """Whether the rasterizer must leave `weights`."""
-        return self.config.strategy == "default" and self.config.min_contribution > 0
-
-    def is_due(self, clock: DensityClock) -> bool:
-        """Whether this step refines."""
+    def is_due(self, clock: DensityClock, seen: float = 1.0) -> bool:
+        """Whether this step refines, where a picture shows the share `seen` of the block in the mean."""
         if not self.config.refine_start <= clock.progress < self._ends(clock.first):
             return False
-        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= self._every(clock)
+        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= self._every(clock, seen)
 
-    def _every(self, clock: DensityClock) -> int:
+    def _every(self, clock: DensityClock, seen: float) -> int:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
-        growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * clock.pace
+        pace = clock.steps / max(clock.progress, 1e-9)  # of the whole run, if it goes on as it has so far
+        growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * pace
         given, usual = self.config.refine_every, min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
-        wanted = max(views, 0 if given else int(usual * USUALLY_SEEN / max(clock.seen, 1e-9)))
+        wanted = max(views, 0 if given else int(usual * USUALLY_SEEN / max(seen, 1e-9)))
         every = max(given or usual, min(wanted, int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
 
-    def refines(self, clock: DensityClock, growth: Mapping[str, Tensor]) -> bool:
-        """Whether this step refines: it is due, and there is something to judge by.
-
-        Args:
-            growth: the block's statistics, this step's included.
-        """
-        if not self.is_due(clock) or WORTH not in growth:
-            return False
-        return self.is_due(replace(clock, seen=share_seen(growth)))
-
     def asks(self, progress: float, first: bool) -> bool:
-        """Whether growth is under way or to come: residuals are summed for it.
-
-        Args:
-            progress: share of the run that is done.
-            first: whether a block among others is in its first visit.
-        """
+        """Whether growth is under way or to come: residuals are summed for it. See DensityClock."""
         return self.config.strategy == "default" and progress < self._ends(first)
 
     def _ends(self, first: bool) -> float:
@@ -190,20 +162,21 @@ class DensityControl:
 
         Args:
             growth: the block's statistics so far, each [n, ...]; WORTH is changed in place.
-            infos: of the step's drawings, after backward.
-            judged: those of the step's pictures whose residuals were summed.
+            infos, judged: of the step's drawings, after backward; pictures whose residuals were summed.
 
         Returns:
             The block's statistics from now on, and whether it was refined.
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth, False
-        growth = added(growth, blend_sums(infos, clock.views))
+        sums = blend_sums(infos, clock.views)
+        growth = {**growth, **{name: growth.get(name, 0.0) + value for name, value in sums.items()}}
         for picture in judged:
             add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
         if not self.asks(clock.progress, clock.first):
             growth.pop(WORTH, None)
-        if not self.refines(clock, growth):
+        # What a picture shows is asked for last: an accelerator is waited for.
+        if WORTH not in growth or not (self.is_due(clock) and self.is_due(clock, share_seen(growth))):
             return growth, False
         return self._refined(params, optimizers, growth, clock), True
 
@@ -215,16 +188,10 @@ class DensityControl:
         progress: float,
         veils: Float[Tensor, "n"] | float = 0.0,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's views, at a share of the run; floaters; and what is
-        too faint for any picture to show, which nothing would train again.
-
-        Args:
-            veils: see `pruning.veils`; what veils more than it contributes goes.
-
-        Returns:
-            The block's statistics from now on.
-        """
-        if not self.wants_weights or not have_contributions(growth):
+        """Take out what fills too little of the block's views, at a share of the run; floaters; what veils
+        more than it contributes, see `pruning.veils`; and what is too faint for any picture to show, which
+        nothing would train again. Gives the block's statistics from now on."""
+        if not self.config.prunes or not have_contributions(growth):
             return growth
         bounds = self.config.min_contribution, FAINT
         least, faint = (risen(bound, progress, self.config.refine_stop) for bound in bounds)
@@ -250,9 +217,3 @@ class DensityControl:
         if bool(faint.any()):
             gsplat_ops.remove(params, optimizers, growth, faint)
         return growth
-
-
-def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Statistics of more drawings added to a block's."""
-    sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
-    return {**growth, **sums}

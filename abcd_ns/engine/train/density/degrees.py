@@ -54,11 +54,7 @@ class Lowered(NamedTuple):
 def are_gone(
     gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"], highest: int
 ) -> Bool[Tensor, "n k 1"]:
-    """Which coefficients are.
-
-    Args:
-        highest: degree of the scene; that of `features_rest` may be lower.
-    """
+    """Which coefficients are, where the scene has this degree; `features_rest` may have a lower one."""
     return ~up_to_degree(highest - gone, features_rest.shape[1])[..., None]
 
 
@@ -66,11 +62,8 @@ def are_gone(
 def lower(
     params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
-    """Let harmonics of the active block go that do not pay, with their moments; see `lowered`.
-
-    Returns:
-        The block's statistics from now on.
-    """
+    """Let harmonics of the active block go that do not pay, with their moments; see `lowered`. Gives the
+    block's statistics from now on."""
     if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
@@ -86,13 +79,8 @@ def lower(
 def lowered(
     gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View], highest: int
 ) -> Lowered:
-    """Gaussians with the degrees that pay. Nobody is judged who was not drawn in all views yet.
-
-    Args:
-        growth: with BLEND_SUMS.
-        views: that the block is trained on.
-        highest: degree of the scene; that of the Gaussians may be lower by now.
-    """
+    """Gaussians with the degrees that pay, by the BLEND_SUMS of the views that their block is trained on; the
+    scene's degree is the highest. None is judged that was not drawn in all views yet."""
     weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
     chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
@@ -107,14 +95,13 @@ def lowered(
 
 def _beside(means: Tensor, views: Sequence[View]) -> _Cameras:
     """On the device of the Gaussians, in one copy."""
-    numbers = torch.stack([_numbers(view) for view in views])
-    viewmats, intrinsics, ends = upload(numbers.to(means.dtype), means.device).split((16, 9, 3), dim=1)
+    rows = []
+    for view in views:
+        ends = view.K.new_tensor([view.width, view.height, view.near])
+        rows.append(torch.cat((view.viewmat.flatten(), view.K.flatten(), ends)))
+    numbers = upload(torch.stack(rows).to(means.dtype), means.device)
+    viewmats, intrinsics, ends = numbers.split((16, 9, 3), dim=1)
     return viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3), ends
-
-
-def _numbers(view: View) -> Float[Tensor, "28"]:
-    ends = view.K.new_tensor([view.width, view.height, view.near])
-    return torch.cat((view.viewmat.flatten(), view.K.flatten(), ends))
 
 
 def _lowered(
@@ -124,11 +111,7 @@ def _lowered(
     cameras: _Cameras,
     highest: int,
 ) -> Lowered:
-    """As `lowered`, at once.
-
-    Args:
-        weight: pixels in all views; NaN for who is not judged, which no comparison finds to be less.
-    """
+    """As `lowered`, at once; a weight, pixels in all views, is NaN for one that is not judged."""
     values = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
     most = gaussians.sh_degree
     gram = _gram(gaussians, cameras, values.shape[1])

@@ -26,11 +26,8 @@ WEIGHT = BLEND_SUMS[0]
 
 
 def chosen(wanted: Float[Tensor, "n"], room: int) -> Bool[Tensor, "n"]:
-    """Which are to become two: all that want to, or as many of those that want to most as there is room for.
-
-    Args:
-        wanted: how much each wants to; 0 for not at all.
-    """
+    """Which are to become two: all that want to, by more than 0, or as many of them as there is room for, of
+    which those that want to most."""
     which = wanted > 0
     if int(which.sum()) <= room:
         return which
@@ -47,15 +44,11 @@ def split_gaussians(
     which: Bool[Tensor, "n"],
     axis: Int64[Tensor, "n"],
 ) -> dict[str, Tensor]:
-    """Make two of each. The others come first, in their order, then one half of each, then the other; their
-    moments begin anew.
-
-    Args:
-        growth: statistics by name, [n, ...] each; both halves inherit them, and half of the weight.
-        axis: of each, along which its halves are to lie.
+    """Make two of each, which lie along its axis. The others come first, in their order, then one half of
+    each, then the other; their moments begin anew.
 
     Returns:
-        The statistics afterwards.
+        The statistics afterwards: both halves inherit them, and half of the weight.
     """
     found, rows = dict(growth), torch.where(which)[0]  # a device is waited for once
     if not len(rows):

@@ -25,9 +25,8 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View, centers_of
 
 BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
-trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
-scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though
-the minimum is in the photo's: so little grows before pictures are large enough to tell."""
+trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used. A reduced
+picture's pixel counts as one: so little grows before pictures are large enough to tell."""
 FULL_PASS = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
@@ -54,24 +53,16 @@ class _BlendWeight(torch.autograd.Function):
 
 
 def with_blend_weights(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float) -> Raster:
-    """The same drawing; backward leaves what each Gaussian weighs in its picture in `info["weights"].grad`.
-
-    Args:
-        raster: drawn with `blend_weights`.
-        in_front: transmittance of what lies before it; None for nothing.
-        share: of the pixels that might have been drawn, those that are.
-    """
+    """The same drawing, made with `blend_weights`; backward leaves in `info["weights"].grad` what each
+    Gaussian weighs in its picture, by the transmittance `in_front` and the share of pixels that are drawn."""
     counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
     color = _BlendWeight.apply(raster.color, raster.depth, counts.detach() / share)
     return Raster(color, raster.transmittance, raster.depth, raster.info)
 
 
 def blend_sums(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
-    """What drawings add to BLEND_SUMS, after backward; each [n]. Nothing if they were drawn without weighing.
-
-    Args:
-        views: that the block is trained on.
-    """
+    """What drawings add to BLEND_SUMS, after backward, where a block is trained on so many views; each [n].
+    Nothing if they were drawn without weighing."""
     found = [info["weights"].grad for info in infos if "weights" in info]
     if not found or any(weights is None for weights in found):
         return {}
@@ -87,12 +78,8 @@ def have_contributions(growth: Mapping[str, Tensor]) -> bool:
 
 
 def contributions(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
-    """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet: such
-    a one is not judged, for no comparison finds it to be less.
-
-    Args:
-        growth: with BLEND_SUMS.
-    """
+    """Pixels that each fills in all of its block's views together, by BLEND_SUMS; NaN for one that was not
+    drawn in all yet, which is not judged: no comparison finds it to be less."""
     weight, passes = (growth[name] for name in BLEND_SUMS)
     return torch.where(passes >= FULL_PASS, weight / passes, torch.nan)
 
@@ -105,17 +92,10 @@ def faded(growth: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: value * half if name in BLEND_SUMS else value for name, value in growth.items()}
 
 
-def floaters(
-    growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint: float = FAINT
-) -> Bool[Tensor, "n"]:
+def floaters(growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint: float) -> Bool[Tensor, "n"]:
     """Which Gaussians are faint and fill more of their block's views than the mean: clouds before cameras, by
-    which the light of single photos is imitated, and which other views look through.
-
-    Args:
-        growth: with BLEND_SUMS.
-        opacities: after the sigmoid.
-        faint: the opacity below which one is, and below FAINTER of their median.
-    """
+    which the light of single photos is imitated, and which other views look through. Faint are opacities,
+    after the sigmoid, below this and FAINTER of their median."""
     full = contributions(growth)
     return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
 

@@ -11,9 +11,6 @@ from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 
-FULL = 0.75
-"""Share of its limit over which a block is cut: the next visit needs room to grow."""
-
 
 def split_full(
     tree: BlockTree, updates: dict[BlockName, BlockState], limits: Limits
@@ -34,7 +31,7 @@ def split_full(
     while waiting:
         block = waiting.pop(0)
         state = updates[block]
-        if not is_full(len(state), tree.num_blocks, limits):
+        if not limits.is_full(len(state), tree.num_blocks):
             continue
         means = state.gaussians.means
         new, cut = tree.num_blocks, tree.split(block, *best_split(means, tree.cell(block)))
@@ -47,20 +44,11 @@ def split_full(
     return tree, updates, parents
 
 
-def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
-    """Whether a block of so many Gaussians, in a scene of so many blocks, is to be cut; see `split_full`."""
-    return limits.block_limit > 0 and gaussians > FULL * limits.of_block(blocks)
-
-
-def with_full(
+def _with_full(
     scene: StoredScene, updates: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
-    """What is about to be persisted, and the blocks that are full with those that wait for their visit. There
-    might be no room for these in it.
-
-    Args:
-        busy: blocks that are being trained.
-    """
+    """What is about to be persisted, and the blocks that are full with those that wait for their visit, but
+    for the busy ones, in training. There might be no room for these in it."""
     pending = updates.get(PENDING)
     if not limits.block_limit or pending is None:
         return updates
@@ -68,7 +56,7 @@ def with_full(
     for block, migrants in split_by_block(pending, scene.tree.assign(pending.gaussians.means)).items():
         # A block whose visit has just ended may have pending migrants, too: what came while it was out.
         rows = len(updates[block]) if block in updates else scene.rows(block)
-        if block not in busy and rows + len(migrants) > FULL * limits.block_limit:
+        if block not in busy and limits.is_full(rows + len(migrants), scene.tree.num_blocks):
             joined[block] = join([updates[block] if block in updates else scene.state(block), migrants])
     return {**updates, **joined, PENDING: without(scene, pending, joined)} if joined else updates
 
@@ -80,16 +68,10 @@ def cut_full(
     limits: Limits,
     announce: Announcer,
 ) -> tuple[BlockTree, dict[BlockName, BlockState]]:
-    """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole.
-
-    Args:
-        updates: as of `split_full`.
-
-    Returns:
-        The tree with the cuts, and everything to persist.
-    """
+    """Cut blocks that have outgrown their limit, see `split_full`; parts inherit what the run knows of the
+    whole. Gives the tree with the cuts, and everything to persist."""
     busy = {visit.geometry.block for visit in state.in_flight}
-    tree, updates, parents = split_full(scene.tree, with_full(scene, updates, limits, busy), limits)
+    tree, updates, parents = split_full(scene.tree, _with_full(scene, updates, limits, busy), limits)
     for new, parent in parents.items():
         state.inherit(new, parent)
         announce(BlockSplit(parent, new))
@@ -97,11 +79,8 @@ def cut_full(
 
 
 def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
-    """Cut the blocks of a run that resumes with smaller limits than it had; nothing where all are in order.
-
-    A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
-    that was the whole scene is over.
-    """
+    """Cut the blocks of a run that resumes with smaller limits than it had. A block among others is cut when
+    the visit that was under way ends, as in the warm-up; that to a block that was the whole scene is over."""
     active = state.active
     for block in range(scene.tree.num_blocks) if limits.block_limit else ():
         in_visit = active is not None and (active.is_whole or active.geometry.block == block)
@@ -109,7 +88,7 @@ def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
             continue
         saved = in_visit and active.saved
         rows = scene.rows(ACTIVE) if saved else scene.count(block)
-        if not is_full(rows, scene.tree.num_blocks, limits):
+        if not limits.is_full(rows, scene.tree.num_blocks):
             continue
         if saved:
             found = scene.state(ACTIVE)

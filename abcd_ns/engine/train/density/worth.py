@@ -54,11 +54,7 @@ def half_of(view: int) -> int:
 
 @torch.no_grad()
 def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, picture: Judged) -> None:
-    """Add what a picture says to WORTH, in place; it begins with zeros.
-
-    Args:
-        axes: along which Gaussians extend.
-    """
+    """Add what a picture says to WORTH, in place, which begins with zeros; Gaussians extend along `axes`."""
     view, means = picture.view, gaussians.means
     if WORTH not in growth:
         growth[WORTH] = means.new_zeros((len(means), COLUMNS))
@@ -110,11 +106,7 @@ def _asked(
 
 
 def share_seen(growth: Mapping[str, Tensor]) -> float:
-    """Of the Gaussians, the share that a picture shows, in the mean; an accelerator is waited for.
-
-    Args:
-        growth: with WORTH.
-    """
+    """The share of the Gaussians that a picture shows in the mean, by WORTH; an accelerator is waited for."""
     shows, _, pictures = growth[WORTH][:, -3:].sum(dim=0).tolist()
     return shows / max(pictures, 1.0)
 
@@ -122,14 +114,8 @@ def share_seen(growth: Mapping[str, Tensor]) -> float:
 def worth(
     growth: Mapping[str, Tensor], views: int, pixels: float
 ) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
-    """Squared error that the best split of each would remove in all views, 0 where that is too little; and
-    the axis to split along.
-
-    Args:
-        growth: with WORTH.
-        views: that the block is trained on.
-        pixels: with the mean error, that a split must remove as much of as they have.
-    """
+    """Squared error that the best split of each would remove in all of the block's views, by WORTH, and the
+    axis to split along; 0 where that is no more than so many average pixels have."""
     *halves, _, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1, 1), dim=1)
     sums = [(halves[k].view(-1, BY_AXIS, 3), halves[k + 1][..., None]) for k in (0, 2)]
     gain = torch.zeros_like(sums[0][0])

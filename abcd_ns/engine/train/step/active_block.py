@@ -14,7 +14,6 @@ from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.pruning import contributions, faded, have_contributions, veils
-from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
@@ -43,14 +42,11 @@ class ActiveBlock:
         return len(self._run.params["means"])
 
     def attach(self, active: ActiveVisit, batch: int, sh_degree: int) -> None:
-        """Make the block of a visit active, as it is stored.
+        """Make the block of a visit active, as it is stored; an OutOfRoomError if it does not fit.
 
         Args:
             batch: views in a step.
             sh_degree: of its first one. Higher harmonics take no memory, but where the block has some.
-
-        Raises:
-            OutOfRoomError: it does not fit on the device.
         """
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(rows_for_visit(*which), sh_degree, run.device)
@@ -66,10 +62,10 @@ class ActiveBlock:
         run.health.begin_visit(active, run.state.health)
         self.growth = {name: value.clone() for name, value in stored.growth.items()}
         self.clocks = stored.clocks
-        come_late = run.config.limits.late_harmonics > 0  # and may have had no time to be of use
-        if active.done == 0 and not (active.saved or active.is_alone or come_late):
+        begins, come_late = active.done == 0 and not active.saved, run.config.limits.late_harmonics > 0
+        if begins and not (active.is_alone or come_late):  # which may have had no time to be of use
             self._lower_degrees()
-        if active.done == 0 and not active.saved and self.clocks.visits == 0:
+        if begins and self.clocks.visits == 0:
             run.health.shrink_oversized(run.views.values(), self._filling())
         self._hold_sizes()
 
@@ -79,7 +75,8 @@ class ActiveBlock:
         self._run.state.sh_degree = max(self._run.state.sh_degree, sh_degree)
 
     def detached(self) -> BlockState:
-        """The active block, on the CPU; it stays active."""
+        """The active block, repaired, on the CPU; it stays active."""
+        self._run.health.look_over()
         if GONE in self.growth:  # what was repaired may have them again
             rest = self._run.params["features_rest"]
             rest.data.masked_fill_(are_gone(self.growth[GONE], rest, self._highest), 0.0)
@@ -97,29 +94,25 @@ class ActiveBlock:
         attach(nobody, run.params, run.optimizers)
         self.growth, self._held = {}, None
 
-    def count_step(self, views: int, taken: int) -> None:
-        """The optimizers have stepped.
-
-        Args:
-            views: that the step was made for.
-            taken: that were drawn.
-        """
-        clocks = self.clocks
-        self.clocks = replace(clocks, adam_views=clocks.adam_views + views, steps=clocks.steps + taken)
-
     def end_visit(self, counts: bool) -> None:
         """A visit has ended, which may count."""
         self.growth.pop(LARGEST, None)
         self.clocks = replace(self.clocks, visits=self.clocks.visits + counts)
 
-    def refine(self, infos: Infos, judged: Sequence[Judged], clock: DensityClock) -> None:
-        """Grow and prune, where it is time for that.
+    def after_step(
+        self, taken: int, batch: int, room: int | None, infos: Infos, judged: Sequence[Judged]
+    ) -> DensityClock:
+        """The optimizers have stepped: grow and prune, where it is time for that.
 
         Args:
-            infos: of the step's drawings; none where its gradients were no numbers.
-            judged: likewise, see DensityControl.after_step.
+            taken: views that the step drew.
+            batch: views that it was made for.
+            room: Gaussians that may be added.
+            infos, judged: see DensityControl.after_step; none where gradients were no numbers.
         """
-        run = self._run
+        run, clocks = self._run, self.clocks
+        self.clocks = replace(clocks, adam_views=clocks.adam_views + batch, steps=clocks.steps + taken)
+        clock = self.density_clock(taken, batch, room)
         for parameter in run.params.values():  # their memory is for what growth takes
             parameter.grad = None
         given = run.params, run.optimizers, self.growth
@@ -128,6 +121,7 @@ class ActiveBlock:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.growth.pop(LARGEST, None)
         self._hold_sizes()
+        return clock
 
     @torch.no_grad()
     def _hold_sizes(self) -> None:
@@ -153,7 +147,7 @@ class ActiveBlock:
         """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
         change too little. What is seen from now on soon counts for more."""
         run, before, found = self._run, len(self), 0.0
-        if before and run.density.wants_weights and run.share >= run.config.density.refine_stop:
+        if before and run.density.config.prunes and run.share >= run.config.density.refine_stop:
             active = active_gaussians(run.params).detach()
             found = veils(active, list(run.views.values()), run.rasterizer, run.config.antialiased)
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
@@ -164,7 +158,7 @@ class ActiveBlock:
     def _lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
         run = self._run
-        if run.density.wants_weights and run.share >= START:
+        if run.density.config.prunes and run.share >= START:
             views = [run.views[view] for view in run.active.trained_on]
             self.growth = lower(run.params, run.optimizers, self.growth, views, self._highest)
 
@@ -178,13 +172,7 @@ class ActiveBlock:
         rest.grad.masked_fill_(self._held[1], 0.0)
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
-        """All that decides whether to refine after a step.
-
-        Args:
-            taken: the step's views.
-            batch: views in each step.
-            room: Gaussians that may be added.
-        """
+        """What decides whether to refine, see `after_step`."""
         run, active = self._run, self._run.active
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
@@ -204,4 +192,4 @@ class ActiveBlock:
     def has_outgrown(self) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
         grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
-        return grown and is_full(len(self), 1, self._run.limits)
+        return grown and self._run.limits.is_full(len(self), blocks=1)

@@ -20,7 +20,6 @@ from abcd_ns.engine.render.residual_sums import ResidualSums
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.worth import Judged
-from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, Layer, View
 
@@ -34,6 +33,11 @@ BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 COMING = 8
 """So many views of the next steps are told of ahead, for their photos."""
+ALIGN = 16
+"""Parts meet at multiples of this in the image, pixels: gsplat's tiles are whole then."""
+PLAY = 64
+"""The room in which the lines between parts move from step to step, where parts are larger, pixels. SSIM's
+windows of 11 px are left out where a line crosses them: by columns, and by rows, one time in five at most."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +86,7 @@ class Sample:
         return mask if by == 1 or mask is None else _mean_of_squares((~mask).float(), by) == 0
 
     def picture(self, raster: Raster, light: Tensor | None = None) -> Float[Tensor, "h w 3"]:
-        """What the rasterizer drew, between the layers and on the background, in its photo's light, 0..1.
-
-        Args:
-            light: the photo's transform, see `lit`.
-        """
+        """What the rasterizer drew, between the layers and on the background, 0..1; see `lit` for `light`."""
         if self.layers is None:
             rgb = composite(raster.layer, self.background)
         else:
@@ -97,15 +97,6 @@ class Sample:
         """What the rasterizer's drawing is shown in; with `blend_weights` as in `with_blend_weights`."""
         front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
         return Frame(front, back, self.background, blend_weights / self.share)
-
-    def residual(
-        self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w c"]
-    ) -> Float[Tensor, "h w 4"]:
-        """Photo less picture as the block sees it, and what of it shows; see ResidualSums."""
-        residual = photo[..., :3] - picture
-        return seen_behind(
-            residual, torch.ones_like(residual[..., 0]) if self.in_front is None else self.in_front
-        )
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
@@ -123,9 +114,11 @@ class Sample:
         return found if self.share == 1 else found / self.share
 
 
-def seen_behind(residual: Float[Tensor, "h w 3"], in_front: Float[Tensor, "h w"]) -> Float[Tensor, "h w 4"]:
+def seen_behind(
+    residual: Float[Tensor, "h w 3"], in_front: Float[Tensor, "h w"] | None
+) -> Float[Tensor, "h w 4"]:
     """A picture's residual as ResidualSums take it, of what lies behind something of this transmittance."""
-    shows = in_front[..., None]
+    shows = torch.ones_like(residual[..., :1]) if in_front is None else in_front[..., None]
     return torch.cat((residual * shows, shows), dim=-1)
 
 
@@ -151,10 +144,12 @@ class Batch:
             few = self.samples[first : first + every]
             yield replace(self, samples=few, share=len(few) / len(self.samples))
 
-    def losses(self, pictures: Pictures, photos: Pictures, config: TrainingConfig) -> list[Float[Tensor, ""]]:
-        """Of each sample."""
+    def loss(self, pictures: Pictures, photos: Pictures, config: TrainingConfig) -> Float[Tensor, ""]:
+        """What it adds to the loss of its step: the mean of the samples', times `share`."""
         triples = zip(self.samples, pictures, photos, strict=True)
-        return [sample.loss(picture, photo, config) for sample, picture, photo in triples]
+        first, *others = [sample.loss(picture, photo, config) for sample, picture, photo in triples]
+        mean = sum(others, start=first) / len(self.samples) if others else first
+        return mean if self.share == 1 else mean * self.share
 
 
 @dataclass(frozen=True)
@@ -183,11 +178,6 @@ class Rendered:
         names = [field.name for field in fields(Rendered)]
         return Rendered(*(tuple(chain(*(getattr(part, name) for part in parts))) for name in names))
 
-    @property
-    def transmittances(self) -> tuple[Float[Tensor, "_h _w"], ...]:
-        """Of the rasters."""
-        return tuple(raster.transmittance for raster in self.rasters)
-
 
 class Residuals:
     """What a step's pictures lack, summed up for each Gaussian by the backward pass: growth judges by it."""
@@ -199,21 +189,14 @@ class Residuals:
     def ask(
         self, rendered: Rendered, samples: Sequence[Sample], pictures: Pictures, photos: Pictures
     ) -> None:
-        """Before the backward pass.
-
-        Args:
-            rendered: of these samples.
-            pictures: what is compared with the photos.
-        """
-        compared = list(zip(samples, pictures, photos, strict=True))
+        """Before the backward pass: what was rendered of these samples, and is compared with photos."""
+        residuals = [photo[..., :3] - picture for picture, photo in zip(pictures, photos, strict=True)]
         for info in (info for info in rendered.infos if "sums" in info):
-            own = [
-                each for raster, each in zip(rendered.rasters, compared, strict=True) if raster.info is info
-            ]
-            info["sums"].ask([sample.residual(picture, photo) for sample, picture, photo in own])
-            for k, (sample, picture, photo) in enumerate(own):
-                error = (photo[..., :3] - picture).square().sum(dim=-1).mean()
-                self._asked.append((info["sums"], k, sample.view, error, sample.share))
+            own = [place for place, raster in enumerate(rendered.rasters) if raster.info is info]
+            info["sums"].ask([seen_behind(residuals[place], samples[place].in_front) for place in own])
+            for k, place in enumerate(own):
+                error = residuals[place].square().sum(dim=-1).mean()
+                self._asked.append((info["sums"], k, samples[place].view, error, samples[place].share))
 
     def found(self) -> list[Judged]:
         """After it; then there are none. Nor are there any of a block of nobody."""
@@ -253,3 +236,57 @@ class Backgrounds:
 def part_to_draw(config: TrainingConfig, crop: Crop, step: int, place: int) -> Crop:
     """What the sample at `place` of a step's batch is drawn of a crop; depends on nothing else."""
     return random_part(crop, config.limits.crop_pixels, random.Random(f"part {config.seed} {step} {place}"))
+
+
+def random_part(crop: Crop, most: int, rng: random.Random) -> Crop:
+    """One of the rectangles that a random grid cuts the crop into, as likely as it is large.
+
+    The grid has as few columns and rows of equal cells as keep these within `most` pixels and nearly square.
+    Where a picture's loss is a sum over pixels, L = sum of l, the sum over a part, times crop.pixels /
+    part.pixels, has the expectation L whatever the grid: a part P is drawn with probability
+    P.pixels / crop.pixels, and the parts of a grid are all of the crop.
+
+    Args:
+        most: pixels of the part; 0 for no limit. A part may have ALIGN x ALIGN in any case.
+        rng: left alone where the crop is small enough.
+    """
+    if most <= 0 or crop.pixels <= most:
+        return crop
+    columns, rows = _counts(crop, most)
+    x, width = _random_span(crop.x, crop.width, columns, rng)
+    y, height = _random_span(crop.y, crop.height, rows, rng)
+    return Crop(x, y, width, height)
+
+
+def _counts(crop: Crop, most: int) -> tuple[int, int]:
+    """Columns and rows of the grid."""
+    columns = rows = 1
+    while True:
+        width, height = _side(crop.x, crop.width, columns), _side(crop.y, crop.height, rows)
+        if width * height <= most or max(width, height) <= ALIGN:
+            return columns, rows
+        if width >= height:
+            columns += 1
+        else:
+            rows += 1
+
+
+def _side(start: int, size: int, count: int) -> int:
+    """Pixels of each of `count` cells along one axis; the grid sticks out of the crop by PLAY or more."""
+    if count == 1:
+        return size
+    covered = size + start % ALIGN
+    play = min(PLAY, covered // count // ALIGN * ALIGN)
+    return ALIGN * max(1, -(-(covered + play) // (count * ALIGN)))
+
+
+def _random_span(start: int, size: int, count: int, rng: random.Random) -> tuple[int, int]:
+    """(first pixel, number of pixels) of the cell that a random pixel lies in."""
+    if count == 1:
+        return start, size
+    side, origin = _side(start, size, count), start - start % ALIGN
+    slack = count * side - (start + size - origin)
+    origin -= ALIGN * rng.randrange(slack // ALIGN + 1)
+    first = origin + (start + rng.randrange(size) - origin) // side * side
+    low, high = max(first, start), min(first + side, start + size)
+    return low, high - low

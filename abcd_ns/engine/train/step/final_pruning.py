@@ -80,19 +80,11 @@ class _Probe:
 
 
 class FinalPruning:
-    """Takes out of a run's scene, all of it stored, as many Gaussians as cost LOSS at most.
-
-    Args:
-        target: gives what a sample should show.
-    """
+    """Takes out of a run's scene, all of it stored, as many Gaussians as cost LOSS at most, by what `target`
+    says that views should show."""
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
-
-    @property
-    def is_wanted(self) -> bool:
-        """Whether the run's options let Gaussians go."""
-        return self._run.density.config.prunes_at_end
 
     def run(self) -> None:
         """Do it; tells listeners how many went, and at what cost."""
@@ -158,11 +150,8 @@ class FinalPruning:
     def _psnr(
         self, scene: BlockScene, views: list[View], worth: Sequence[Tensor], least: float, rounds: int
     ) -> float:
-        """Mean over views without what is worth no more than `least`, dB.
-
-        Args:
-            rounds: that are done; listeners are told.
-        """
+        """Mean over views without what is worth no more than `least`, dB; listeners are told how many rounds
+        are done."""
         device = self._run.device
         left = ChangedScene(scene, lambda block, found: found[(worth[block] > least).to(device)])
         pictures = self._whole.pictures(views, left)

@@ -24,12 +24,9 @@ EVERY, SHARE = 1.0, 0.04
 
 
 class PoseRounds:
-    """Refines all poses of a run once in a while, each by a picture of the whole scene.
+    """Refines all poses of a run once in a while, each by a picture of the whole scene beside its `target`.
 
     Never while a visit among others is under way: its layers are drawn from the poses with which it began.
-
-    Args:
-        target: gives what a sample should show.
     """
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
@@ -71,7 +68,6 @@ class PoseRounds:
                 picture, weight = judged[view.index]
                 steps[view.index] = step_for(view, picture, weight, by_step(by_matrix, view.viewmat))
         run.poses.move(steps)
-        run.take_poses()
         run.state.posed = run.state.uses
 
     def _judge(self, view: View, picture: Raster) -> tuple[Float[Tensor, "h w 3"], Tensor]:

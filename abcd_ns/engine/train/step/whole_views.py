@@ -17,11 +17,7 @@ from abcd_ns.engine.types import View
 
 
 class WholeViews:
-    """Draws what a run's scene looks like in its training views.
-
-    Args:
-        target: gives what a sample should show.
-    """
+    """Draws a run's scene in its training views, beside what `target` says that they should show."""
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._target = run, target
@@ -35,11 +31,7 @@ class WholeViews:
         return list(run.views_at(reduction).values())
 
     def pictures(self, views: list[View], scene: BlockScene) -> WholePictures:
-        """Draws these of the views.
-
-        Args:
-            scene: the run's, or what it would be.
-        """
+        """Draws these views of a scene: the run's, or what it would be."""
         run = self._run
         # Half of what a visit's have: here a view is drawn backward beside them.
         room = parts_bytes(run, views, run.blocks, share=0.5)

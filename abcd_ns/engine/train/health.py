@@ -6,7 +6,7 @@ without all this, on a CPU bit for bit: healthy tensors are read, never written.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,46 +14,42 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.events import Announcer, Repaired
-from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
+from abcd_ns.engine.gaussians.adam import Adam
+from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.commit import state_for_visit
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import WHOLE
-from abcd_ns.engine.train.health.health_rules import (
-    HIDDEN,
-    OVERSIZED_ANGLE,
-    stand_ins,
-    unsound,
-    wider_than,
-)
-from abcd_ns.engine.train.health.step_guard import StepGuard
 from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.transfer import StepNumbers
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.transfer import StepNumbers, upload
+from abcd_ns.engine.types import Gaussians, View, centers_of
 
 LATE_AFTER = 16
 """Steps without a fault after which an accelerator's gradients are looked at a step late, without a wait."""
+STAND_IN_OPACITY = -9.0
+"""Logit of the opacity of a Gaussian that takes the place of one that was lost; far below MIN_ALPHA."""
+LARGEST_LOG_SCALE = 40.0
+"""A standard deviation of e^40; its square still is a number in float32."""
+OVERSIZED_ANGLE = 0.3
+"""An oversized Gaussian's standard deviation is over this share of its distance to the nearest camera: 3
+sigma cover 45 degrees to either side. What is far away, sky for instance, may be large."""
+HIDDEN = 1e-4
+"""A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
+DISTANCES_AT_ONCE = 1 << 22
+"""Between Gaussians and cameras."""
 
 
 class Health:
-    """Watches the active block of a coordinator.
+    """Watches the active block of a coordinator; shrinks oversized Gaussians only if it `may_act`.
 
     Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
-
-    Args:
-        may_act: also shrink oversized Gaussians.
     """
 
     def __init__(
-        self,
-        scene: VisitScene,
-        params: Params,
-        optimizers: Optimizers,
-        announce: Announcer,
-        *,
-        may_act: bool,
+        self, scene: VisitScene, params: Params, optimizers: Optimizers, announce: Announcer, *, may_act: bool
     ) -> None:
         self.may_act = may_act
         self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
@@ -70,11 +66,7 @@ class Health:
             optimizer.register_step_pre_hook(self._clean_gradients)
 
     def begin_visit(self, active: ActiveVisit, health_by_block: HealthByBlock) -> None:
-        """A block was attached.
-
-        Args:
-            health_by_block: the run's, to be written to.
-        """
+        """A block was attached; what is found is written to the run's `health_by_block`."""
         self._active, self._health_by_block = active, health_by_block
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
@@ -85,10 +77,7 @@ class Health:
         self._shares.append(share)
 
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
-        """Call after the optimizers stepped.
-
-        Args:
-            errors: the mean squared one of each picture that the step drew.
+        """Call after the optimizers stepped, with the mean squared error of each picture that the step drew.
 
         Returns:
             Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
@@ -106,13 +95,10 @@ class Health:
 
     @torch.no_grad()
     def shrink_oversized(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> None:
-        """Shrink Gaussians that are too large for every camera, along the axes that are.
+        """Shrink Gaussians, but for the spared, that are too large for every camera, along the axes that are.
 
         Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
         mean: from anywhere else it may come before what it lies behind, and veil half the picture.
-
-        Args:
-            spared: stay as they are.
         """
         if not self.may_act:
             return
@@ -128,29 +114,19 @@ class Health:
 
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Logarithms of standard deviations that none may grow beyond, lest it be oversized. A value that is
-        no number bounds nothing.
-
-        Args:
-            spared: may grow as they like.
-        """
+        """Logarithms of standard deviations that none but the spared may grow beyond, lest it be oversized. A
+        value that is no number bounds nothing."""
         scales = self._params["scales"]
         _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
         return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
 
-    def end_visit(self, detach: Callable[[], BlockState]) -> BlockState:
-        """What the visit leaves behind: the active block, repaired.
-
-        Args:
-            detach: takes the active block out.
-        """
-        self.look_over()
-        state, record, active = detach(), self._record, self._active
+    def end_visit(self) -> None:
+        """The visit to the active block, which was looked over, is over."""
+        record, active = self._record, self._active
         record.visits += 1
         if active.done:  # else time ran out before anybody could see
             record.hidden = not active.shown
         self._active = self._attached = None
-        return state
 
     def count(self, what: str, count: int) -> None:
         """So much of the active block had to be repaired; see BlockHealth for what."""
@@ -162,7 +138,7 @@ class Health:
             self._announce(Repaired(number, None if alone else active.geometry.block, what, count))
 
     def look_over(self) -> None:
-        """Repair all that is no number in the active block; call when a visit ends, and before saving."""
+        """Repair all that is no number in the active block; call before it is persisted."""
         self._read()
         self._repair()
 
@@ -252,3 +228,116 @@ class Health:
     def _record(self) -> BlockHealth:
         block = WHOLE if self._active is None else self._active.geometry.block
         return self._health_by_block.setdefault(block, BlockHealth())
+
+
+class StepGuard:
+    """Has an accelerator skip a step whose gradients are no numbers, while the host knows of nothing.
+
+    It tells fused Adams by `found_inf`, as a GradScaler does; they step one after the other, in any order.
+    Those that are `Adam` share one step count, which is advanced here: one kernel for all of them.
+    """
+
+    def __init__(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        self._optimizers = optimizers
+        self._told: list[torch.optim.Optimizer] = []
+        self._found: Float[Tensor, ""] | None = None
+        self.found: list[Float[Tensor, ""]] = []
+        """1 for each round of steps that was skipped, 0 for the others; the reader empties it."""
+
+    @property
+    def works(self) -> bool:
+        """Whether all optimizers can be told."""
+        return all(optimizer.defaults.get("fused") for optimizer in self._optimizers.values())
+
+    def record(self, optimizer: torch.optim.Optimizer, skips: bool) -> None:
+        """Call before it steps; with `skips` they do nothing if a gradient is no number. The gradients of all
+        are looked at when the first of them does."""
+        if not self._told or any(told is optimizer for told in self._told):
+            self._told, self._found = [], self._begin(skips)
+        self._told.append(optimizer)
+        optimizer.found_inf = self._found
+
+    @torch.no_grad()
+    def _begin(self, skips: bool) -> Float[Tensor, ""] | None:
+        """Count a round of steps; whether it is skipped, if it may be."""
+        count, norms = self._count(), self._norms() if skips else []
+        if not norms:
+            if count is not None:
+                count.add_(1)
+            return None
+        found = None if count is None else fused.skips(count, norms)
+        if found is None:
+            sound = torch.stack(norms).sum() < math.inf
+            found = torch.logical_not(sound, out=torch.empty((), device=sound.device))
+            if count is not None:
+                count.add_(sound)
+        self.found.append(found)
+        return found
+
+    def _count(self) -> Float[Tensor, ""] | None:
+        """The steps of all that are `Adam`, which share it from now on."""
+        count = None
+        for optimizer in self._optimizers.values():
+            if isinstance(optimizer, Adam):
+                optimizer.counts = False
+                for state in optimizer.state.values():
+                    count = state["step"] if count is None else count
+                    state["step"] = count
+        return count
+
+    def _norms(self) -> list[Float[Tensor, ""]]:
+        """Of all gradients. An overflow of the squares counts, as it would in Adam's second moment."""
+        parameters = [p for o in self._optimizers.values() for p in o.param_groups[0]["params"]]
+        gradients = [p.grad for p in parameters if p.grad is not None and p.grad.numel()]
+        return list(torch._foreach_norm(gradients)) if gradients else []
+
+
+def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Which Gaussians hold a value that is no number, or a scale whose square is none."""
+    bad = gaussians.scales.amax(dim=1) > LARGEST_LOG_SCALE
+    for _, value in gaussians.items():
+        bad = bad | ~torch.isfinite(value).flatten(1).all(dim=1)
+    return bad
+
+
+@torch.no_grad()
+def wider_than(
+    angle: float, scales: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], views: Iterable[View]
+) -> tuple[Bool[Tensor, "n 3"], Float[Tensor, "n 1"]]:
+    """Along which axes a standard deviation, of which `scales` are logarithms, is over this share of the
+    distance to the nearest camera, and the logarithm of what would not be."""
+    views = tuple(views)
+    near = torch.tensor([[view.near] for view in views], dtype=torch.float64)
+    cameras = upload(torch.cat((centers_of(views), near), dim=1).to(means.dtype), means.device)
+    nearest = means.new_full((len(means),), math.inf)
+    for few in cameras.split(max(DISTANCES_AT_ONCE // max(len(means), 1), 1)):
+        nearest = torch.minimum(nearest, torch.maximum(_distances(means, few[:, :3]), few[:, 3]).amin(dim=1))
+    allowed = (angle * nearest).log()[:, None]
+    return scales > allowed, allowed
+
+
+def _distances(ours: Float[Tensor, "n 3"], theirs: Float[Tensor, "m 3"]) -> Float[Tensor, "n m"]:
+    """Not by a matrix product, which loses what is near."""
+    if ours.device.type == "cpu":  # elsewhere this makes a block of threads for each distance
+        return torch.cdist(ours, theirs, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.linalg.vector_norm(ours[:, None] - theirs, dim=-1)
+
+
+@torch.no_grad()
+def share_of_picture(in_front: Float[Tensor, "h w"] | None, own: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """How large a part of a picture a block can be, 0..1, by the transmittance of what lies before it, if
+    anything, and its own, with what was sorted in."""
+    alpha = 1 - own
+    return (alpha if in_front is None else in_front * alpha).mean()
+
+
+def stand_ins(sound: Gaussians, count: int) -> Gaussians:
+    """`count` Gaussians amid the `sound` ones, as large as they usually are, and too faint to be drawn."""
+    known = len(sound) > 0
+    values = {name: value.new_zeros((count, *value.shape[1:])) for name, value in sound.items()}
+    for name in ("means", "scales"):
+        if known:
+            values[name] += getattr(sound, name).median(dim=0).values
+    values["quats"][:, 0] = 1.0
+    values["opacities"] += STAND_IN_OPACITY
+    return Gaussians(**values)
