@@ -117,10 +117,8 @@ HIDDEN = tuple(
     if option.name not in HONOURED and not option.name.startswith("_")
 )
 """Options of splatfacto's model that have no effect, or are set under other names."""
-NOT_BELOW_0 = (
-    "blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb",
-    "datamanager.photo_cache_gb",
-)  # fmt: skip
+_BUDGETS = ("device_budget_gb", "gaussian_bytes", "ram_budget_gb", "datamanager.photo_cache_gb")
+NOT_BELOW_0 = ("blocks", "near_plane", *_BUDGETS)
 
 
 def check_options(config: TrainerConfig) -> None:

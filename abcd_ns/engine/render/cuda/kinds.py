@@ -39,10 +39,18 @@ def _place_splats(
     gaussians: Gaussians, cameras: tuple[Tensor, Tensor], like: View, antialiased: bool
 ) -> OnScreen:
     """Shapes are conics."""
-    shapes, size = (None, gaussians.quats, gaussians.scales.exp()), (like.width, like.height)
-    options = {"near_plane": like.near, "packed": False, "calc_compensations": antialiased}
-    found = fully_fused_projection(gaussians.means, *shapes, *cameras, *size, **options)
-    radii, means2d, depths, conics, compensations = found
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        gaussians.means,
+        None,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        *cameras,
+        like.width,
+        like.height,
+        near_plane=like.near,
+        packed=False,
+        calc_compensations=antialiased,
+    )
     return radii, means2d, depths, conics, means2d, compensations
 
 
@@ -53,11 +61,23 @@ def _place_surfels(
 
     The boxes' middles are found anew: gsplat's own gradient of theirs lacks some terms.
     """
-    discs, size = (gaussians.means, gaussians.quats, gaussians.scales.exp()), (like.width, like.height)
-    found = fully_fused_projection_2dgs(*discs, *cameras, *size, near_plane=like.near, packed=False)
-    radii, _, depths, rays, _ = found
+    radii, _, depths, rays, _ = fully_fused_projection_2dgs(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        *cameras,
+        like.width,
+        like.height,
+        near_plane=like.near,
+        packed=False,
+    )
     matrix = rays / rays[..., 2:, 2:]
-    centers, (a, b, c, d, e, f) = matrix[..., :2, 2], matrix[..., :2].flatten(-2).unbind(-1)
+    centers, (a, b), (c, d), (e, f) = (
+        matrix[..., :2, 2],
+        matrix[..., 0, :2].unbind(-1),
+        matrix[..., 1, :2].unbind(-1),
+        matrix[..., 2, :2].unbind(-1),
+    )
     u, v = matrix[..., :2, 2].unbind(-1)  # anew: these are no part of what `centers` gets as its gradient
     distance = e * e + f * f - 1
     off = ((a - u * e) * e + (b - u * f) * f, (c - v * e) * e + (d - v * f) * f)

@@ -183,9 +183,18 @@ class Drawing:
         if len(splats) == 0:
             return Drawing(kind, splats, means2d, shapes, layout, splats.cameras, splats.cameras.int())
         _, rows, cols = layout.shape
-        ids = {"camera_ids": splats.cameras, "gaussian_ids": splats.cameras}  # asked for, and not read
-        where, options = (means2d, splats.radii, splats.depths), {"packed": True, "n_cameras": len(crops)}
-        _, isect_ids, flatten_ids = isect_tiles(*where, TILE, cols, rows, **options, **ids)
+        _, isect_ids, flatten_ids = isect_tiles(
+            means2d,
+            splats.radii,
+            splats.depths,
+            TILE,
+            cols,
+            rows,
+            packed=True,
+            n_cameras=len(crops),
+            camera_ids=splats.cameras,
+            gaussian_ids=splats.cameras,  # asked for, and not read
+        )
         return Drawing(kind, splats, means2d, shapes, layout, isect_ids, flatten_ids)
 
     @property
@@ -309,11 +318,19 @@ class Drawing:
         flatten_ids: Int[Tensor, "q"],
     ) -> tuple[Tensor, Tensor]:
         cameras, rows, cols = self.layout.shape
-        lists = isect_offset_encode(self.isect_ids, cameras, cols, rows), flatten_ids
-        # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
-        options = {"masks": self.layout.drawn(means2d.device), "packed": True}
-        splats = means2d, shapes, features, opacities
-        return self.kind.draw(*splats, *self.layout.size, TILE, *lists, **options)
+        return self.kind.draw(
+            means2d,
+            shapes,
+            features,
+            opacities,
+            *self.layout.size,
+            TILE,
+            isect_offset_encode(self.isect_ids, cameras, cols, rows),
+            flatten_ids,
+            # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
+            masks=self.layout.drawn(means2d.device),
+            packed=True,
+        )
 
     @property
     def parts(self) -> list[tuple[slice, slice]]:

@@ -11,9 +11,17 @@ BLOCK = 256
 
 @triton.jit(do_not_specialize=("count", "always", "bits", "tiles"))
 def _inside(
-    isect_ids_ptr, flatten_ids_ptr, near_ptr, far_ptr, keep_ptr,
-    count, always, bits, tiles, BLOCK: tl.constexpr,
-):  # fmt: skip
+    isect_ids_ptr,
+    flatten_ids_ptr,
+    near_ptr,
+    far_ptr,
+    keep_ptr,
+    count,
+    always,
+    bits,
+    tiles,
+    BLOCK: tl.constexpr,
+):
     """[q]: 1 where a pair is within its tile's window, or its owner is one of the first, else 0."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = at < count
@@ -29,9 +37,16 @@ def _inside(
 
 @triton.jit(do_not_specialize=("count", "last_key"))
 def _move_up(
-    isect_ids_ptr, flatten_ids_ptr, keep_ptr, kept_ptr, new_isect_ids_ptr, new_flatten_ids_ptr,
-    count, last_key, BLOCK: tl.constexpr,
-):  # fmt: skip
+    isect_ids_ptr,
+    flatten_ids_ptr,
+    keep_ptr,
+    kept_ptr,
+    new_isect_ids_ptr,
+    new_flatten_ids_ptr,
+    count,
+    last_key,
+    BLOCK: tl.constexpr,
+):
     """[q] each: what is kept, in order; then `last_key`, and 0 for the owner."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = at < count
@@ -65,8 +80,15 @@ def windowed(
     count = len(isect_ids)
     if count == 0:
         return isect_ids, flatten_ids
-    keep, grid = torch.empty_like(flatten_ids), (triton.cdiv(count, BLOCK),)
+    keep, new_isect_ids, new_flatten_ids = (
+        torch.empty_like(flatten_ids),
+        torch.empty_like(isect_ids),
+        torch.empty_like(flatten_ids),
+    )
+    grid = (triton.cdiv(count, BLOCK),)
     _inside[grid](isect_ids, flatten_ids, near, far, keep, count, always, bits, tiles, BLOCK=BLOCK)
-    kept, moved = keep.cumsum(0), (torch.empty_like(isect_ids), torch.empty_like(flatten_ids))
-    _move_up[grid](isect_ids, flatten_ids, keep, kept, *moved, count, last_key, BLOCK=BLOCK)
-    return moved
+    kept = keep.cumsum(0)
+    _move_up[grid](
+        isect_ids, flatten_ids, keep, kept, new_isect_ids, new_flatten_ids, count, last_key, BLOCK=BLOCK
+    )
+    return new_isect_ids, new_flatten_ids
