@@ -130,7 +130,8 @@ class Planner(Visits):
         if self._scene.tree.num_blocks == 1:
             return self._sole_visit(block, showing)
         used, earlier = self._views_used(len(showing)), state.health.get(block, BlockHealth()).visits
-        doubtful = tuple(sorted(views.keys() - set(showing)))
+        # Where no influence is on record, none is compared with it.
+        doubtful = tuple(sorted(views.keys() - set(showing))) if block in state.influence else ()
         chosen = visit_views(showing, used, earlier, seed)
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.

@@ -1,5 +1,7 @@
 """A block is trained on the views that it has influence on."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -198,3 +200,15 @@ def test_a_block_that_a_wall_hides_is_neither_read_nor_drawn(tmp_path, monkeypat
         assert all(float(off.mean()) < 5e-4 for off in off_from_merged(run, batch, rendered.pictures))
         run.end_visit()
     assert len(hidden) == 4
+
+
+def test_where_no_influence_is_known_no_view_is_doubtful(tmp_path):
+    """With so many views that a sample of means tells which see a block: some show its edge alone."""
+    aside = [camera((4.0, 0.0, 0.0), (0.0, 3.5, 0.01 * index), index, (24, 18)) for index in range(120)]
+    views = [view if view.index % 2 else replace(view, viewmat=ring_of_views(1)[0].viewmat) for view in aside]
+    run = make_coordinator(tmp_path, random_gaussians(200, size=0.3), views, blocks=2, steps=400)
+    for _ in range(2):
+        run.begin_visit()
+        assert run.state.active.looked_at == ()
+        run.end_visit()
+    assert run.state.influence == {}

@@ -48,7 +48,7 @@ def split_gaussians(
     each, then the other; their moments begin anew.
 
     Returns:
-        The statistics afterwards: both halves inherit them, and half of the weight.
+        The statistics afterwards: both parts inherit them, and half of the weight.
     """
     found, rows = dict(growth), torch.where(which)[0]  # a device is waited for once
     if not len(rows):
