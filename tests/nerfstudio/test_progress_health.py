@@ -21,9 +21,10 @@ def coordinator(tmp_path):
 
 
 def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
-    """What matters less is left out."""
+    """What matters less is left out. nerfstudio's console is made 120 wide, whatever the terminal is."""
     file = io.StringIO()
-    monkeypatch.setattr(progress, "CONSOLE", Console(file=file, force_terminal=True, width=80))
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(progress, "CONSOLE", Console(file=file, force_terminal=True, width=120))
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LOOKS", 0.0)
     coordinator.run.stopwatch = Stopwatch(60.0)
     coordinator.state.step = 1

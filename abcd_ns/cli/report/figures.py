@@ -39,7 +39,7 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[tuple[str, str, str]
         psnr, ssim = (story.held_out[-1].psnr, story.held_out[-1].ssim) if story.held_out else (None, None)
     share = log_lines.layer_share(story.visits)
     layers = f", {share:.0%} of the time for layers" if share else ""
-    taken = f"{story.end.seconds:.1f} s" if story.end.seconds < 100 else clock(story.end.seconds)
+    taken = f"{story.end.seconds:.1f} s" if story.end.seconds < 60 else clock(story.end.seconds)
     ram, device = _peaks(run)
     of = f"of {machine.ram_bytes / GIB:.0f} GiB"
     memory = ("peak RAM", ram, of)

@@ -1,6 +1,7 @@
 """Where the training stands, in the terminal: epoch, block, steps, PSNR, Gaussians, memory, time left."""
 
 import math
+import shutil
 import time
 from collections.abc import Sequence
 
@@ -130,9 +131,10 @@ class ProgressReport:
         if self._live is None:
             self._live = Live(console=CONSOLE, transient=True)
             self._live.start()
-        while len(parts) > 2 and len("  ".join(parts)) >= CONSOLE.width:
+        columns = min(CONSOLE.width, shutil.get_terminal_size().columns)  # nerfstudio's width is always 120
+        while len(parts) > 2 and len("  ".join(parts)) >= columns:
             parts.pop()
-        self._live.update(Text("  ".join(parts)[: CONSOLE.width - 1]))
+        self._live.update(Text("  ".join(parts)[: columns - 1]))
 
     def _print(self, line: str) -> None:
         self._shown = time.monotonic()
