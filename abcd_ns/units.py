@@ -4,5 +4,7 @@ MIB, GIB = 2**20, 2**30
 
 
 def bytes_in_words(count: float) -> str:
-    """So many bytes: whole MiB, from one GiB on GiB to a tenth."""
-    return f"{count / GIB:.1f} GiB" if count >= GIB else f"{count / MIB:.0f} MiB"
+    """So many bytes: GiB to a tenth, whole MiB, or below ten of them two digits."""
+    if count >= GIB:
+        return f"{count / GIB:.1f} GiB"
+    return f"{count / MIB:.0f} MiB" if count >= 9.95 * MIB else f"{count / MIB:.2g} MiB"

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from abcd_ns.cli.report.run_folder import read_story
+from abcd_ns.arguments import check_ranges
+from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.terminal import print_facts, print_plain
 from abcd_ns.cli.train import tool
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.lab.runs.runner import take_folder, taking
 from abcd_ns.lab.world.table_scene import LAST, draw_table
 from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine

@@ -16,6 +16,7 @@ from rich.console import Console
 from torch import Tensor
 
 from abcd_ns import methods
+from abcd_ns.arguments import Number, check_ranges
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, thin_points
@@ -28,7 +29,6 @@ from abcd_ns.engine.train.schedule import evenly, views_per_step
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.options import Number, check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views

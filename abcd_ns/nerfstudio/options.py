@@ -180,9 +180,11 @@ def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
 
 
 def nearest(name: str, known: Iterable[str]) -> list[str]:
-    """The three names most like `name`, by the last part or the whole; splatfacto's come last."""
-    ends = {each: each.rpartition(".")[2] for each in known}
-    alike = difflib.get_close_matches(name.rpartition(".")[2], sorted({*ends.values()}), n=3, cutoff=0.8)
+    """The three names most like `name`, by words of the last part, that part or the whole; splatfacto's come
+    last."""
+    ends, last = {each: each.rpartition(".")[2] for each in known}, name.rpartition(".")[2]
+    alike = sorted({end for end in ends.values() if {*end.split("_")} < {*last.split("_")}})
+    alike += difflib.get_close_matches(last, sorted({*ends.values()}), n=3, cutoff=0.8)
     found = [each for end in alike for each in ends if ends[each] == end]
     found += difflib.get_close_matches(name, ends, n=3, cutoff=0.8)
     return sorted(dict.fromkeys(found), key=lambda each: "model." in each)[:3]

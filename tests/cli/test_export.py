@@ -83,8 +83,9 @@ def test_those_that_nobody_sees_yet_are_left_out(run, tmp_path):
     assert (tmp_path / "waiting.ply").read_bytes() == (tmp_path / "without.ply").read_bytes()
 
 
-def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path):
+def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path, capsys):
     assert export(run, out=tmp_path / "scene.ply", frame="nerfstudio") == 0
+    assert "1 Gaussian too transparent to be drawn left out." in capsys.readouterr().out
     found = by_position(read(tmp_path / "scene.ply"))
     kept = scene[torch.arange(len(scene)) != 7]
     kept = kept[torch.from_numpy(np.lexsort(kept.means.T.numpy()))]

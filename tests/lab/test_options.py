@@ -35,6 +35,7 @@ def test_a_change_is_read_by_the_type_of_its_option(text, path, value):
     [
         ("training.warmpu=0.1", "no option 'training.warmpu'; did you mean training.warmup?"),
         ("warmup=0.1", "did you mean training.warmup?"),
+        ("model.num_blocks=4", "did you mean blocks?"),
         ("nonsense=1", "docs/reference.md lists them"),
         ("training.batch=many", "training.batch is 'many'; it must be a whole number"),
         ("training.warmup=nan", "must be a number"),

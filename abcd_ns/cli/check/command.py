@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from abcd_ns.arguments import check_ranges
 from abcd_ns.cli.check.survey import Survey, survey
 from abcd_ns.cli.findings import Finding, error, note, print_findings, warning
 from abcd_ns.cli.terminal import few, print_facts, print_plain
@@ -17,7 +18,6 @@ from abcd_ns.data.photos import default_budget
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.data.scene import Lens
 from abcd_ns.engine.train.memory import parameter_bytes
-from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.units import bytes_in_words
 
 MIDDLE = (0.05, 0.95)

@@ -12,6 +12,7 @@ import tyro
 
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.cli.paths import check_file, find_run
+from abcd_ns.cli.terminal import many
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
@@ -21,6 +22,7 @@ from abcd_ns.formats.packed import BYTES_AT_ONCE
 from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.progress_bar import tracked
 from abcd_ns.run import STATE, STORE
+from abcd_ns.units import bytes_in_words
 
 TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file with the transform from the data's frame to the run's."""
@@ -68,8 +70,10 @@ def export(
         if not counts:
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
         if suffix in PACKED:
-            needed = (max if by_block else sum)(counts.values()) * BYTES_AT_ONCE / 2**20
-            print(f"{suffix} is packed at once, in about {needed:,.0f} MiB of RAM; .ply and .glb are not.")
+            needed = (max if by_block else sum)(counts.values()) * BYTES_AT_ONCE
+            print(
+                f"{suffix} is packed at once, in about {bytes_in_words(needed)} of RAM; .ply and .glb are not."
+            )
         write = _write_parts if by_block else _write
         written = write(scene, counts, out, suffix)
     _report(written, counts, scene, suffix)
@@ -131,7 +135,9 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
 def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffix: str) -> None:
     size, count = sum(path.stat().st_size for path in written), sum(counts.values())
     where = written[0] if len(written) == 1 else f"{written[0].parent} ({len(written)} files)"
-    print(f"{where}: {count:,} Gaussians, {size / 2**20:.1f} MiB, {size / count:.0f} bytes each")
+    print(f"{where}: {count:,} Gaussians, {bytes_in_words(size)}, {size / count:.0f} bytes each")
+    if scene.faint:
+        print(f"{many(scene.faint, 'Gaussian', 'Gaussians')} too transparent to be drawn left out.")
     tell_rounding(suffix, scene.largest, scene.size)
     if scene.antialiased:
         print("Trained antialiased: enable antialiasing in the viewer, or thin things look too thick.")

@@ -58,6 +58,8 @@ class Shown:
         self.antialiased: bool = self.store.header.get(MADE_FOR, {}).get("antialiased", False)
         self._corners = torch.zeros(0, 3, dtype=torch.float64)
         """The lowest and highest coordinates so far."""
+        self.faint = 0
+        """Of those that were counted, how many no rasterizer draws."""
 
     @cached_property
     def sh_degree(self) -> int:
@@ -77,12 +79,14 @@ class Shown:
     def count(self, block: int) -> int:
         """How many of the block's Gaussians are to be written."""
         found = self._load(block, ("means", "opacities"))
-        return int(self._kept(self._placed(found["means"]), found["opacities"]).sum())
+        here, drawn = self._here(self._placed(found["means"])), shows(found["opacities"])
+        self.faint += int((here & ~drawn).sum())
+        return int((here & drawn).sum())
 
     def gaussians(self, block: int) -> Gaussians:
         """Those Gaussians."""
         found = Gaussians(**self._load(block, PARAM_NAMES))
-        found = found[self._kept(self._placed(found.means), found.opacities)]
+        found = found[self._here(self._placed(found.means)) & shows(found.opacities)]
         if not len(found):
             return found
         exact = torch.cat((self._corners, self._placed(found.means)))
@@ -109,5 +113,5 @@ class Shown:
     def _placed(self, means: Tensor) -> Tensor:
         return means.double() if self.to is None else self.to.points(means)
 
-    def _kept(self, means: Tensor, opacities: Tensor) -> Bool[Tensor, "n"]:
-        return shows(opacities) if self.box is None else shows(opacities) & inside(self.box, means)
+    def _here(self, means: Tensor) -> Bool[Tensor, "n"]:
+        return torch.ones(len(means), dtype=torch.bool) if self.box is None else inside(self.box, means)

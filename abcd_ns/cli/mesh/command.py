@@ -32,6 +32,7 @@ from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.run import STORE
 from abcd_ns.run.fit import FREE_SHARE, RamShares
 from abcd_ns.run.store import MadeFor
+from abcd_ns.units import bytes_in_words
 
 VOXEL_PIXELS = 2.0
 """The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
@@ -83,8 +84,8 @@ def mesh(
         vertices = to.points(torch.from_numpy(surface.vertices)).numpy()
         with replacing(out) as partly:
             write_ply(partly, replace(surface, vertices=vertices))
-    size, faces = out.stat().st_size / 2**20, len(surface.faces)
-    said = f"{len(vertices):,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side * to.scale:.3g}"
+    size, faces = bytes_in_words(out.stat().st_size), len(surface.faces)
+    said = f"{len(vertices):,} vertices, {faces:,} faces, {size}, voxels of {side * to.scale:.3g}"
     print(f"{out}: {said}")
     tell_rounding(".ply", float(np.abs(vertices).max()), float(np.ptp(vertices, axis=0).max()))
     return 0

@@ -10,7 +10,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from nerfstudio.cameras.cameras import Cameras
 
-from abcd_ns.cli.report.run_folder import Checkpoint, Story
+from abcd_ns.cli.report.run_folder import Checkpoint
+from abcd_ns.cli.report.story import Story
 from abcd_ns.lab.results.style import COLORS, in_style, lay_grid
 from abcd_ns.nerfstudio.run.log_lines import SampleLine, TrainingLine
 from abcd_ns.units import GIB

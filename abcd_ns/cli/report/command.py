@@ -14,6 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from rich.console import Console
 
 from abcd_ns import __version__
+from abcd_ns.arguments import check_ranges
 from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.cli.report import charts, figures
 from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
@@ -23,10 +24,10 @@ from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import ERROR_GAIN
 from abcd_ns.lab.results.tables import NOTHING, about_machine
-from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.run.log_lines import EndLine, TrainingLine
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
+from abcd_ns.units import bytes_in_words
 
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
@@ -75,7 +76,7 @@ def report(
     out.write_text(render_page(found, held_out, cameras, notes), "utf-8", "backslashreplace")
     for note in notes:
         print_plain(note, console, "yellow")
-    print_plain(f"{out} ({out.stat().st_size / 2**20:.1f} MiB)", console)
+    print_plain(f"{out} ({bytes_in_words(out.stat().st_size)})", console)
     return 0
 
 

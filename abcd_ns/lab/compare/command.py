@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
+from abcd_ns.arguments import Flag, check_numbers, check_ranges, words
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.budgets import ALONE, JOINT, WITHIN, draw_budgets, shares_of, within_budgets
@@ -33,7 +34,7 @@ from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.configs import REGISTERED, check_options, check_scene
-from abcd_ns.lab.runs.options import Flag, check_numbers, check_ranges, parse_changes, words
+from abcd_ns.lab.runs.options import parse_changes
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
 

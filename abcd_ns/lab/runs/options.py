@@ -1,4 +1,4 @@
-"""Options: those of commands, checked; and a method's own, by their dotted names, read from text and set."""
+"""A method's options by their dotted names, read from text and set."""
 
 import dataclasses
 import math
@@ -7,20 +7,14 @@ import typing
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Any, Literal, Union
 
 import msgspec
-import tyro
 
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import nearest
 from abcd_ns.nerfstudio.run.settings import flat_options
 
-LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "pictures": 0, "max_gaussians": 0}
-"""The least that a number may be, by option; 1 for those that are not here."""
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
-"""A switch."""
-Number = Annotated[int, tyro.conf.arg(metavar="N")]
 PREFIX = "pipeline."
 """May stand before a method's option, as in `ns-train`."""
 _SCORED = "it would change the photos that scores are taken from"
@@ -44,26 +38,6 @@ WORDS = {
     type(None): "none",
 }
 """Types of options that can be written as one word, beside Literal, and what may be written."""
-
-
-def words(metavar: str, *aliases: str) -> Any:
-    """How --help shows an option without a default of its own."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
-
-
-def check_ranges(given: Mapping[str, int | None], low: int = 1) -> None:
-    """Raise a UserError if a number is below `LOWEST`, or `low` where that does not name it; None is none."""
-    for name, value in given.items():
-        least = LOWEST.get(name, low)
-        if value is not None and value < least:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {least}.")
-
-
-def check_numbers(option: str, numbers: Sequence[int], low: int) -> None:
-    """Raise a UserError unless a list has different numbers from `low` up."""
-    if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < low:
-        text = " ".join([option, *map(str, numbers)])
-        raise UserError(f"{text}: give different numbers from {low} up.")
 
 
 def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:

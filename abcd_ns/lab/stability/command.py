@@ -11,10 +11,10 @@ from typing import Annotated
 import torch
 from rich.console import Console
 
+from abcd_ns.arguments import Flag, Number, check_ranges, words
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.results import Outcome
 from abcd_ns.lab.results.tables import findings_of, headline
-from abcd_ns.lab.runs.options import Flag, Number, check_ranges, words
 from abcd_ns.lab.runs.runner import claim, new_results, say, write_report
 from abcd_ns.lab.stability import scenarios
 from abcd_ns.lab.stability.lab import Lab, Scenario

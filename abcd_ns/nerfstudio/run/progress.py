@@ -88,9 +88,10 @@ class ProgressReport:
             self._live.stop()
             self._live = None
         state = self._coordinator.state
+        steps = "1 step" if state.step == 1 else f"{state.step:,} steps"
         visits = "1 visit" if state.visit == 1 else f"{state.visit} visits"
         seconds = clock(self._coordinator.stopwatch.seconds)
-        say(f"Trained {state.step:,} steps in {visits}, {seconds}: {self._summary()}.")
+        say(f"Trained {steps} in {visits}, {seconds}: {self._summary()}.")
         lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
         wanted, degree = self._coordinator.config.sh_degree, state.sh_degree
         if self._coordinator.config.limits.late_harmonics and degree < wanted:

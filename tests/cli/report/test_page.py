@@ -20,7 +20,8 @@ from abcd_ns.cli.report.figures import (
     training_command,
 )
 from abcd_ns.cli.report.held_out import HeldOut, pick
-from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run, read_story
+from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
+from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks
@@ -102,9 +103,9 @@ def test_the_page_says_what_was_measured(shown, tmp_path):
         assert kind == "data:image/svg+xml"
         assert b"</svg>" in base64.b64decode(content)
     assert all(image["alt"] for image in page.all("img"))
-    (slider,) = page.all("input")  # the view that the page opens with is not repeated
-    assert slider["type"] == "range"
-    assert "0000.png" in slider["aria-label"]
+    sliders = page.all("input")  # the view that the page opens with, and beside its error
+    assert [slider["type"] for slider in sliders] == ["range"] * 2
+    assert all("0000.png" in slider["aria-label"] for slider in sliders)
     # Without pictures the last evaluation of the log stands in.
     assert tiles(made_up_run(tmp_path), None)[0][1] == "24.50 dB"
 

@@ -69,8 +69,8 @@ def test_a_run_becomes_one_page_that_tells_what_terminal_and_log_tell(trained, c
     assert cli.main(["report", str(copied), *data, "--pictures", "2"]) == 0  # over its own page
     page = (copied / "report.html").read_text()
     assert str(copied / "report.html") in capsys.readouterr().out
-    assert page.count('type="range"') == 2
-    assert len(re.findall(r'src="data:image/png', page)) == 6
+    assert page.count('type="range"') == 3
+    assert len(re.findall(r'src="data:image/png', page)) == 8
     assert len(re.findall(r"<tr><td>\d</td>", page)) == 3
     assert "--max-num-iterations 36" in page
     assert f"Of {HELD_OUT} held-out views" in page

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from abcd_ns.cli.report.charts import draw_progress
-from abcd_ns.cli.report.run_folder import Story, read_story
+from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.lab.results.records import RecordError
 from abcd_ns.nerfstudio.run.log_lines import EndLine, layer_share
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
