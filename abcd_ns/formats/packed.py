@@ -7,11 +7,16 @@ import zipfile
 from collections.abc import Iterable
 
 import numpy as np
+import torch
 
+from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
 
+OPENGL = Frame(torch.diag(torch.tensor([1.0, -1, -1]).double()), torch.zeros(3).double(), 1.0)
+"""To .spz's axes, right, up, back, from those of .ply: right, down, front (nianticlabs/spz, README). Its readers
+turn them back; gaussforge 0.6 does not turn them."""
 BYTES_AT_ONCE = 1000  # of RAM that a Gaussian of degree 3 needs while it is packed (.spz), measured
 
 
@@ -30,7 +35,8 @@ def packed(
     import gaussforge
 
     table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0
-    for gaussians in parts:
+    for part in parts:
+        gaussians = OPENGL.gaussians(part) if kind == "spz" else part
         table[done : done + len(gaussians)] = rows(gaussians)
         done += len(gaussians)
     if kind == "compressed.ply":
