@@ -15,8 +15,10 @@ from abcd_ns.errors import UserError
 from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
 
 OPENGL = Frame(torch.diag(torch.tensor([1.0, -1, -1]).double()), torch.zeros(3).double(), 1.0)
-"""To .spz's axes, right, up, back, from those of .ply: right, down, front (nianticlabs/spz, README). Its readers
-turn them back; gaussforge 0.6 does not turn them."""
+"""To .spz's axes, right, up, back, from .ply's: right, down, front (nianticlabs/spz, README). Its readers
+turn them back, but gaussforge 0.6 does not turn them."""
+MOST_SOG = 1 << 16
+"""Gaussians with harmonics that gaussforge packs into a .sog in 7 s. Of one more it shares them, in hours."""
 BYTES_AT_ONCE = 1000  # of RAM that a Gaussian of degree 3 needs while it is packed (.spz), measured
 
 

@@ -125,8 +125,8 @@ def cloud():
 
 
 def test_spz_is_read_by_its_description(cloud, tmp_path):
-    """nianticlabs/spz, README: columns of fixed widths, one attribute after the other; axes are right, up, back,
-    and .ply's right, down, front, as splat-transform 2.7.1 reads both."""
+    """nianticlabs/spz, README: columns of fixed widths, one attribute after the other. Axes are right, up and
+    back, .ply's right, down and front; splat-transform 2.7.1 reads both so."""
     raw = gzip.decompress(write(tmp_path / "scene.spz", cloud, ".spz").read_bytes())
     magic, version, count, degree, fraction = struct.unpack_from("<IIIBB", raw)
     assert (magic, version, count, degree) == (0x5053474E, 3, len(cloud), 3)

@@ -18,8 +18,9 @@ from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import Z_TO_Y
-from abcd_ns.formats.packed import BYTES_AT_ONCE
+from abcd_ns.formats.packed import BYTES_AT_ONCE, MOST_SOG
 from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
+from abcd_ns.formats.streamed import write_streamed
 from abcd_ns.progress_bar import tracked
 from abcd_ns.run import STATE, STORE
 from abcd_ns.units import bytes_in_words
@@ -36,6 +37,7 @@ def export(
     *,
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")],
     by_block: bool = False,
+    lod: bool = False,
     box: Annotated[Box | None, tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")] = None,
     frame: Literal["data", "nerfstudio"] = "data",
 ) -> int:
@@ -44,6 +46,8 @@ def export(
     abcd export outputs/garden/abcd/TIME --out garden.ply
 
     abcd export outputs/garden/abcd/TIME --out parts --by-block
+
+    abcd export outputs/garden/abcd/TIME --out streamed --lod
 
     The suffix of --out sets the format. .ply is read everywhere and loses nothing. .spz, .sog and
     .compressed.ply are for the web, 4 to 15 times smaller. .glb is glTF with KHR_gaussian_splatting.
@@ -55,14 +59,18 @@ def export(
         run: Folder of the run, outputs/SCENE/METHOD/TIME, or its config.yml.
         out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb.
             With --by-block a new folder, whose files are .ply, or end as its own name does.
+            With --lod a new folder.
         by_block: Write one file for each block.
+        lod: Write streamed SOG, of which viewers load what they show, as coarse as its distance allows.
         box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
         frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
             "nerfstudio" has those of the run, its viewer and `ns-export`.
     """
     check_request(out, box)
+    if by_block and lod:
+        raise UserError("--lod cuts the scene into files by itself; leave out --by-block.")
     run = find_run(run, STORE)
-    suffix = suffix_of(out, ".ply" if by_block else None)
+    suffix = suffix_of(Path(".sog") if lod else out, ".ply" if by_block else None)
     to = to_data(run) if frame == "data" else None
     with stored(run) as store:
         scene = Shown(store, to, box)
@@ -70,11 +78,13 @@ def export(
         if not counts:
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
         if suffix in PACKED:
-            needed = (max if by_block else sum)(counts.values()) * BYTES_AT_ONCE
-            print(
-                f"{suffix} is packed at once, in about {bytes_in_words(needed)} of RAM; .ply and .glb are not."
-            )
-        write = _write_parts if by_block else _write
+            most = (max if by_block or lod else sum)(counts.values())
+            if suffix == ".sog" and not lod and most > MOST_SOG and scene.sh_degree:
+                why = f"A .sog of {most:,} Gaussians with harmonics takes hours to pack"
+                raise UserError(f"{why}; use --lod, or .compressed.ply.")
+            ram = bytes_in_words(most * BYTES_AT_ONCE)
+            print(f"{suffix} is packed at once, in about {ram} of RAM; .ply and .glb are not.")
+        write = _write_levels if lod else _write_parts if by_block else _write
         written = write(scene, counts, out, suffix)
     _report(written, counts, scene, suffix)
     return 0
@@ -121,15 +131,26 @@ def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list
 
 
 def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
-    out.mkdir()
-    written = []
-    try:
+    with _new_folder(out):
         for block in tracked(counts, "writing"):
-            written += _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
+            _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
+    return list(out.iterdir())
+
+
+def _write_levels(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:  # noqa: ARG001
+    with _new_folder(out):
+        parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
+        return write_streamed(out, parts, scene.antialiased)
+
+
+@contextmanager
+def _new_folder(out: Path) -> Iterator[None]:
+    out.mkdir()
+    try:
+        yield
     except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
         raise
-    return written
 
 
 def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffix: str) -> None:
