@@ -63,7 +63,7 @@ class Scenery:
 
     def _draw_box(self, number: int, box: Box, status: Status, visible: bool) -> None:
         active, edges = status is Status.ACTIVE, edges_of(box)
-        look = {"color": COLORS[status], "line_width": 2.0 if active else 1.0, "visible": visible}
+        look = {"color": COLORS[status], "line_width": 3.0 if active else 2.0, "visible": visible}
         straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": len(edges) - 1}
         self._scene.add_spline_catmull_rom(f"/abcd/block_{number}", edges, **straight, **look)
         if len(self._boxes) <= MOST_LABELS:

@@ -80,7 +80,7 @@ def export(
         if suffix in PACKED:
             most = (max if by_block or lod else sum)(counts.values())
             if suffix == ".sog" and not lod and most > MOST_SOG and scene.sh_degree:
-                why = f"A .sog of {most:,} Gaussians with harmonics takes too long; up to {MOST_SOG:,} are quick"
+                why = f"A .sog of {most:,} Gaussians with harmonics takes too long; {MOST_SOG:,} are quick"
                 raise UserError(f"{why}. To pack more, use --lod, or .compressed.ply.")
             ram = bytes_in_words(most * BYTES_AT_ONCE)
             print(f"{suffix} is packed at once, in about {ram} of RAM; .ply and .glb are not.")
