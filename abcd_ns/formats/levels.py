@@ -92,7 +92,7 @@ def merged(first: Gaussians, second: Gaussians) -> Gaussians:
 
 def _area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """What a Gaussian fills from its broadest side, without a constant; float64."""
-    return (scales.double().sum(dim=1) - scales.double().amin(dim=1)).exp()
+    return (scales.double().sum(dim=1) - scales.double().amin(dim=1)).exp().clamp_min(1e-100)
 
 
 def _covariance(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
