@@ -22,8 +22,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from abcd_ns.cli.terminal import few, print_plain
-from abcd_ns.data.input_errors import Problems
-from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_size, visible_files
+from abcd_ns.data.colmap_model import CAMERA_MODELS
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.picture_files import SUFFIXES, UNPOSED, UNREAD, check_complete, read_size, visible_files
 from abcd_ns.errors import UserError, first_line
 
 WORK = "poses.part"
@@ -92,9 +93,9 @@ def poses(
     names, sizes = _look(photos)
     if (data / "sparse").exists():
         raise UserError(f"{data / 'sparse'} exists already; move it away to find poses anew.")
-    lenses = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    lenses = [name for name, _ in CAMERA_MODELS.values()]
     if lens not in lenses:
-        raise UserError(f"--lens {lens} is no camera model of COLMAP's: {', '.join(lenses)}.")
+        raise UserError(f"--lens {lens} is none of the camera models that are read: {', '.join(lenses)}.")
     console, notes = Console(), _unread(photos)
     if not several_lenses and len(sizes) > 1:
         several_lenses = True
@@ -126,22 +127,30 @@ def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
     """The photos' names in their folder, sorted, and what sizes they have."""
     if not folder.is_dir():
         raise UserError(f"{folder} does not exist; put the photos there.")
-    found = sorted(path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
+    found = sorted(path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES - UNPOSED)
     if len(found) < FEWEST:
         words = f"{folder} has {len(found)} photos; at least {FEWEST} are needed, better 30."
         raise UserError(" ".join([words, *_unread(folder)]))
     problems, sizes = Problems(), set()
     for path in found:
         with problems.collect():
+            _check_name(path)
             sizes.add(read_size(path))
             check_complete(path)
     problems.raise_if_any()
     return tuple(str(path.relative_to(folder)) for path in found), sizes
 
 
+def _check_name(path: Path) -> None:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{path.parent}: the photo name {path.name!r} is not UTF-8; rename it.") from None
+
+
 def _unread(folder: Path) -> list[str]:
     """A sentence about pictures in the folder that are passed over, if there are any."""
-    kinds = Counter(path.suffix for path in visible_files(folder) if path.suffix.lower() in UNREAD)
+    kinds = Counter(path.suffix for path in visible_files(folder) if path.suffix.lower() in UNREAD | UNPOSED)
     if not kinds:
         return []
     (most, _), *_ = kinds.most_common()

@@ -25,7 +25,7 @@ IMAGES = Path("images")  # where its photos lie, if nothing else is said
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """COLMAP's guess of down (+y) becomes nerfstudio's down (-z). A permutation: it rounds nothing."""
 
-_MODELS = {
+CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
     2: ("SIMPLE_RADIAL", 4),
@@ -101,7 +101,12 @@ def _count_photos(model: Path) -> int:
     path = _part(model, "images")
     if path is None:
         return 0
-    return _Cursor(path).take("Q")[0] if path.suffix == ".bin" else (sum(1 for _ in _lines(path)) + 1) // 2
+    if path.suffix == ".txt":
+        return (sum(1 for _ in _lines(path)) + 1) // 2
+    try:
+        return _Cursor(path).take("Q")[0]
+    except InputError:  # another model may be sound
+        return -1
 
 
 def _photo_folder(data: Path, images: Path, names: list[str]) -> Path:
@@ -145,7 +150,7 @@ def _lens(model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
 
 
 def _unsupported(path: Path, number: int, model: object) -> InputError:
-    names = ", ".join(name for name, _ in _MODELS.values())
+    names = ", ".join(name for name, _ in CAMERA_MODELS.values())
     fix = "undistort the scene with `colmap image_undistorter`"
     return InputError(f"{path}: camera {number} has the model {model}, not one of {names}; {fix}.")
 
@@ -202,9 +207,9 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
     cursor, lenses = _Cursor(path), {}
     for _ in range(cursor.count(24 + 3 * 8)):
         number, model, width, height = cursor.take("IiQQ")
-        if model not in _MODELS:
+        if model not in CAMERA_MODELS:
             raise _unsupported(path, number, f"number {model}")
-        name, size = _MODELS[model]
+        name, size = CAMERA_MODELS[model]
         lenses[number] = _lens(name, width, height, cursor.take(f"{size}d"))
     cursor.finish()
     return lenses
@@ -258,7 +263,7 @@ def _broken_line(path: Path, number: int) -> InputError:
 
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
-    sizes, lenses = dict(_MODELS.values()), {}
+    sizes, lenses = dict(CAMERA_MODELS.values()), {}
     for number, line in _lines(path):
         words = line.split()
         if not words:
@@ -290,7 +295,8 @@ def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
         images.append((name, pose[:4], pose[4:], camera))
         number, observed = next(lines, (number + 1, ""))
         # Editors drop empty lines; the next image would then be taken for this one's 2D points.
-        if observed and not observed.rsplit(maxsplit=1)[-1].removeprefix("-").isdigit():
+        words = observed.split()
+        if words and (len(words) % 3 or not words[-1].removeprefix("-").isdigit()):
             raise InputError(
                 f"{path}, line {number}: not the 2D points of {name}; an image takes two lines, of which the "
                 "second may be empty: export the model again."

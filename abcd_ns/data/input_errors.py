@@ -75,6 +75,7 @@ class Problems(list[str]):
         for first, *others in self._alike.values():
             if len(others) >= FEW:
                 lines[lines.index(first)] += f" {len(others)} others have the same fault."
-                lines = [line for line in lines if line not in set(others)]
+                alike = set(others)
+                lines = [line for line in lines if line not in alike]
         if lines:
             raise InputError(*lines)

@@ -150,6 +150,8 @@ def _check_size(path: Path, size: tuple[int, int], frame: Frame, of: int) -> Non
 
 def _note_unposed(scene: Scene) -> None:
     """Note photos that the model knows nothing of: training goes on without them."""
+    if scene.model.name.startswith("transforms_"):  # the others are of another split, or depths and normals
+        return
     folder = scene.photo_folder
     posed = {os.path.abspath(folder / frame.name) for frame in scene.frames}
     known = posed | {os.path.abspath(frame.mask_path) for frame in scene.frames if frame.mask_path}

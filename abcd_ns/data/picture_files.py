@@ -16,6 +16,8 @@ from abcd_ns.data.input_errors import InputError
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"})
 """What counts as a photo when a folder is listed."""
 
+UNPOSED = frozenset({".webp"})
+"""Of these, what COLMAP does not read."""
 UNREAD = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"})
 """Pictures that cameras and phones write, and nothing here reads."""
 
@@ -94,8 +96,14 @@ class FileFinder:
 
 
 def visible_files(folder: Path) -> Iterator[Path]:
-    """All files below a folder but for what systems hide there: macOS's ._a.jpg, Synology's @eaDir."""
-    for at, folders, names in os.walk(folder):
+    """All files below a folder, through links, too. Not what systems hide there: macOS's ._a.jpg, Synology's
+    @eaDir."""
+    seen = set()
+    for at, folders, names in os.walk(folder, followlinks=True):
+        if (place := os.path.realpath(at)) in seen:  # a link that leads up again
+            folders.clear()
+            continue
+        seen.add(place)
         folders[:] = [name for name in folders if not name.startswith(_HIDDEN)]
         yield from (Path(at, name) for name in names if not name.startswith(_HIDDEN))
 

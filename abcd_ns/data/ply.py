@@ -109,10 +109,10 @@ def _vertices(path: Path, fix: str) -> np.ndarray:
     """A row for each vertex, names in lower case; `fix` ends what is said of a file that cannot be read."""
     with path.open("rb") as file:
         head = file.read(_MAX_HEADER)
-    end = head.find(b"end_header")
+    end = head.find(b"\nend_header") + 1
     start = head.find(b"\n", end) + 1
     try:
-        if not head.startswith(b"ply") or end < 0 or start == 0:
+        if not head.startswith(b"ply") or end == 0 or start == 0:
             raise ValueError("is not a .ply file")
         order, count, row, alone = _parse_header(head[:end].decode("ascii", "replace"))
         body = np.memmap(path, np.uint8, "r", start) if path.stat().st_size > start else np.empty(0, np.uint8)

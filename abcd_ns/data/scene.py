@@ -71,9 +71,13 @@ class SplitLists:
 
     train: frozenset[str]
     held_out: frozenset[str]
+    fault: InputError | None = None
+    """Why they are no split; raised where one is needed."""
 
     def rows(self, names: Sequence[str], split: str) -> list[int]:
         """Rows of `names` that belong to "train", or else to the views held out."""
+        if self.fault is not None:
+            raise self.fault
         wanted = self.train if split == "train" else self.held_out
         return [row for row, name in enumerate(names) if name in wanted]
 
@@ -116,6 +120,8 @@ def distorted_lens(plain: Lens, coefficients: Sequence[float], label: str) -> Le
     k1, k2, k3, k4, p1, p2 = coefficients
     if k4 != 0 and not plain.fisheye:  # of the 8th power of r
         raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
+    if plain.fisheye and (p1 or p2):
+        raise InputError(f"{label} has p1 = {p1:g}, p2 = {p2:g}, which no fisheye has; undistort it first.")
     lens = replace(plain, distortion=(k1, k2, k3, k4) if plain.fisheye else (k1, k2, p1, p2, k3))
     check_lens(lens, label)
     return lens
@@ -152,18 +158,31 @@ def check_layout(scene: Scene) -> None:
 def split_lists(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
 ) -> SplitLists | None:
-    """The lists that there are as one split; None without any. What is held out is val and test together. If
-    only one side is listed, the other is all the rest. `found` is what each list names, `known` the name of
-    each frame by what lists call it, and `label` what messages call the list of a split."""
-    if not found:
-        return None
-    problems, everything = Problems(), frozenset(known.values())
+    """The lists that there are as one split, or why they are none; None without any.
+
+    What is held out is val and test together. If only one side is listed, the other is all the rest.
+
+    Args:
+        found: what each list names.
+        known: the name of each frame, by what lists call it.
+        label: what messages call the list of a split.
+    """
+    try:
+        return _one_split(found, known, label) if found else None
+    except InputError as error:
+        return SplitLists(frozenset(), frozenset(), error)
+
+
+def _one_split(
+    found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
+) -> SplitLists:
+    problems, everything, fix = Problems(), frozenset(known.values()), f"set {OPTION}eval-mode interval"
     for split, names in found.items():
         unknown = [name for name in dict.fromkeys(names) if name not in known]
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
-            problems.append(f"{label(split)} names {photos} without a pose ({few}); correct the list.")
+            problems.append(f"{label(split)} names {photos} without a pose ({few}); correct it, or {fix}.")
     problems.raise_if_any()
     listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
@@ -172,7 +191,6 @@ def split_lists(
         held_out = everything - train
     if not (train and held_out):
         side = "hold out" if train else "train on"
-        fix = f"set {OPTION}eval-mode interval"
         raise InputError(f"{label(next(iter(found)))} leaves nothing to {side}; {fix}.")
     return SplitLists(train, held_out)
 

@@ -65,19 +65,28 @@ def read_split_transforms(folder: Path) -> Scene:
     """The scene of transforms_train.json and of transforms_test.json, or else transforms_val.json, which must
     be in one world, with the points of the first. Its frames are named from `folder` on."""
     paths = [folder / f"{TRANSFORMS}_{split}.json" for split in ("train", "test", "val")]
-    scenes = [read_transforms(path) for path in [path for path in paths if path.exists()][:2]]
-    train, frames, names = scenes[0], [], []
-    for scene in scenes:
+    train, *others = [path for path in paths if path.exists()][:2]
+    train, frames, names = read_transforms(train), [], []
+    for scene in (train, *map(_held_out, others)):
         same = np.array_equal(train.applied_transform, scene.applied_transform)
         if not same or train.applied_scale != scene.applied_scale:
             raise InputError(f"{scene.model} and {train.model} need the same applied_transform; make both.")
         at = os.path.relpath(scene.photo_folder, folder)
         found = [replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames]
         names.append(frozenset(frame.name for frame in found))
-        frames += found
+        # A view may be trained on and held out.
+        there = {frame.name: frame.camera_to_world for frame in frames}
+        frames += [f for f in found if not np.array_equal(there.get(f.name), f.camera_to_world)]
     frames.sort(key=lambda frame: frame.name)
     split = SplitLists(*names) if len(names) > 1 else None
     return replace(train, photo_folder=folder, frames=frames, split_lists=split)
+
+
+def _held_out(path: Path) -> Scene:
+    try:
+        return read_transforms(path)
+    except InputError as error:
+        raise InputError(*error.lines, f"To hold out every 8th view instead, move {path} away.") from None
 
 
 def _load(path: Path) -> dict[str, Any]:

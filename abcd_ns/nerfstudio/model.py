@@ -201,6 +201,11 @@ class AbcdModel(SplatfactoModel):
             camera.camera_type = torch.full_like(camera.camera_type, CameraType.PERSPECTIVE.value)
         return replace(view_of(camera), near=self.near)
 
+    def set_background(self, background_color: Tensor) -> None:
+        """The viewer's, which counts where the config leaves it open, as with splatfacto."""
+        if self.config.background_color == "random":
+            super().set_background(background_color)
+
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
         # ns-render's crop has a background of its own.
         override = renderers.BACKGROUND_COLOR_OVERRIDE

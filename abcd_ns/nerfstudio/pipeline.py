@@ -114,7 +114,8 @@ class AbcdPipeline(VanillaPipeline):
             self.coordinator.dismiss()
             evaluates = trainer.config.steps_per_eval_all_images and self.datamanager.eval_dataset
             if self.coordinator.finished and trainer.training_state == "completed" and evaluates:
-                self.get_average_eval_image_metrics(step)
+                with trainer.train_lock:  # browsers set the model's crop and background
+                    self.get_average_eval_image_metrics(step)
             report.close()
             log.close()
 

@@ -245,7 +245,8 @@ class AbcdTrainer(Trainer):
         """Finish a run that has had its steps or seconds, but not all that comes after."""
         if self.pipeline.coordinator.progress >= 1.0:
             self._signals.hold()
-            self.pipeline.coordinator.complete()
+            with self.train_lock:
+                self.pipeline.coordinator.complete()
             self._signals.release()
             self.config.max_num_iterations = 0
 
@@ -278,6 +279,7 @@ class AbcdTrainer(Trainer):
             self._signals.check()
 
     def _end_report(self) -> None:
+        self._training_state = "training"  # it was not completed, so nothing is scored, or not again
         for callback in self.callbacks:
             callback.run_callback_at_location(self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
 

@@ -76,7 +76,7 @@ def train(
     options, folder = options or RunOptions(), Path(out) / STATE / STORE
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     training, (places, colors) = options.training, points
-    _check(views, photos, options, device, folder)
+    _check(views, photos, steps, options, device, folder)
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
 
@@ -129,9 +129,16 @@ def render(
 
 
 def _check(
-    views: Sequence[View], photos: Sequence[Photo], options: RunOptions, device: torch.device, folder: Path
+    views: Sequence[View],
+    photos: Sequence[Photo],
+    steps: int,
+    options: RunOptions,
+    device: torch.device,
+    folder: Path,
 ) -> None:
     options.training.check()
+    if steps < 1 or (options.max_seconds is not None and not options.max_seconds > 0):
+        raise UserError("steps must be at least 1, and options.max_seconds above 0.")
     if manifest_path(folder).exists():
         raise UserError(f"{folder} holds a run already: choose another folder for `out`.")
     if len(views) != len(photos) or not views:

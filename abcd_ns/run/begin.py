@@ -26,7 +26,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_stored
 from abcd_ns.engine.train.layer_source import LayerRoom
-from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size
+from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size, limits_at
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -126,7 +126,8 @@ def begin_run(
             fitted |= fit.fit_run(options, device_bytes, *photos, there, on_cpu, blocks).limits
         training = replace(training, limits=replace(training.limits, **fitted))
         if start is not None:
-            cut_stored(scene, RunState.from_json(store.state), training.limits)
+            state = RunState.from_json(store.state)
+            cut_stored(scene, state, limits_at(training, state.sh_degree))
         drawn = rasterizer, params, optimizers
         run = TrainingRun(training, budget, scene, capture.views, *drawn, device=device)
         trainer = _trainer_of(run, options, capture, device_bytes, remote)

@@ -1,5 +1,6 @@
 """`abcd poses`: photos alone become a data set, and what cannot is said."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -101,9 +102,23 @@ def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
         poses.poses(tmp_path)
     shutil.rmtree(tmp_path / "images")
     write_blank(tmp_path, 3)
-    with pytest.raises(UserError, match="--lens EYE is no camera model"):
+    with pytest.raises(UserError, match="--lens EYE is none of the camera models"):
         poses.poses(tmp_path, lens="EYE")
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_photos_that_colmap_does_not_read_are_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(poses, "find_poses", None)
+    write_blank(tmp_path, 3)
+    for number in range(3):
+        (tmp_path / "images" / f"{number}.png").rename(tmp_path / "images" / f"{number}.webp")
+    with pytest.raises(UserError, match=r"has 0 photos.*Not read: 3 \.webp; make JPEGs of them"):
+        poses.poses(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    write_blank(tmp_path, 3)
+    (tmp_path / "images" / "0.png").rename(tmp_path / "images" / os.fsdecode(b"\xe9.png"))
+    with pytest.raises(UserError, match="is not UTF-8; rename it"):
+        poses.poses(tmp_path)
 
 
 def test_photos_of_two_sizes_have_two_lenses(tmp_path, monkeypatch, capsys):

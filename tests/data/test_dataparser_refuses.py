@@ -338,3 +338,25 @@ def test_file_that_is_no_json_is_refused(scene, text):
     write_transforms(scene)
     (scene / "transforms.json").write_text(text)
     assert "not valid JSON" in refusal(scene)
+
+
+def test_split_lists_that_do_not_fit_do_not_matter_where_another_split_is_set(scene):
+    write_transforms(scene, test_filenames=[])
+    assert "set --pipeline.datamanager.dataparser.eval-mode interval" in refusal(scene)
+    assert parser(scene, eval_mode="interval").rows("train")
+
+
+def test_a_model_that_cannot_be_read_does_not_hide_another(scene):
+    (scene / "sparse/1").mkdir()
+    (scene / "sparse/1/cameras.bin").write_bytes((scene / "sparse/0/cameras.bin").read_bytes())
+    (scene / "sparse/1/images.bin").write_bytes(b"")
+    assert parser(scene).prepared().scene.model == scene / "sparse/0"
+
+
+def test_thousands_of_photos_that_are_missing_are_told_at_once():
+    problems = Problems()
+    for number in range(20_000):
+        with problems.collect(name=f"{number}.jpg"):
+            raise InputError(f"{number}.jpg cannot be read; copy the photo there.")
+    with pytest.raises(InputError, match="19999 others have the same fault"):
+        problems.raise_if_any()  # in a minute, if it grew with their square

@@ -84,7 +84,7 @@ def test_blender_scenes_come_in_their_splits(tmp_path, splits, held_out):
         f"train/r_{k}.png" for k in range(3)
     ]
     assert {path.parent.name for path in test.image_filenames} == {held_out}
-    assert AbcdDataset(train)[0]["image"].shape == (24, 32, 4)
+    assert AbcdDataset(train).get_data(0, "uint8")["image"].shape == (24, 32, 4)
     theirs = BlenderDataParserConfig(data=data).setup().get_dataparser_outputs("train")
     assert torch.allclose(train.cameras.fx, theirs.cameras.fx.float())
     back = train.transform_poses_to_original_space(train.cameras.camera_to_worlds, "opengl")
@@ -118,3 +118,30 @@ def test_other_methods_do_not_reduce_photos(scene):
     write_photos(scene / "images_2", divide=2)
     outputs = parser(scene, as_stored=True, downscale_factor=2).get_dataparser_outputs()
     assert outputs.cameras.width.max() == SIZES[0][0] // 2
+
+
+def test_a_view_may_be_trained_on_and_held_out(tmp_path):
+    data = write_blender(tmp_path, ("train",))
+    shutil.copy(data / "transforms_train.json", data / "transforms_test.json")
+    found = parser(data)
+    assert found.rows("train") == found.rows("test") == [0, 1, 2]
+    (data / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": []}))
+    assert "To hold out every 8th view instead, move" in refusal(data)
+
+
+def test_depths_and_normals_beside_a_split_are_no_photos_without_a_pose(tmp_path):
+    data = write_blender(tmp_path)
+    for k in range(9):
+        Image.new("RGB", (32, 24)).save(data / "test" / f"r_{k}_depth_0001.png")
+    assert "no pose" not in " ".join(parser(data).prepared().notes)
+
+
+def test_folders_that_are_links_are_searched_and_loops_end(scene):
+    meta = write_transforms(scene)
+    for frame in meta["frames"]:
+        frame["file_path"] = "C:\\work\\" + frame["file_path"].replace("/", "\\")
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    (scene / "images").rename(scene.parent / "elsewhere")
+    (scene / "images").symlink_to(scene.parent / "elsewhere")
+    (scene / "images" / "again").symlink_to(scene)
+    assert len(parser(scene).get_dataparser_outputs("train").image_filenames) > 0

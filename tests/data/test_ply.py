@@ -87,3 +87,10 @@ def test_binary_clouds(tmp_path, order):
         path.write_bytes(broken)
         with pytest.raises(InputError, match=r"points\.ply"):
             read_points(path)
+
+
+def test_a_comment_may_name_the_headers_end(tmp_path):
+    path = tmp_path / "points.ply"
+    head = "ply\nformat ascii 1.0\ncomment before end_header\nelement vertex 1\n"
+    path.write_text(head + "property float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n")
+    assert read_points(path)[0].tolist() == [[1, 2, 3]]

@@ -111,3 +111,9 @@ def test_a_frame_has_the_last_word_however_it_is_spelled(scene):
             assert (lens.fisheye, lens.distortion[0], lens.fx) == (False, 0.1, pytest.approx(lens.width / 2))
         else:
             assert (lens.fisheye, lens.distortion[0]) == (True, 0.3)
+
+
+@WHERE
+def test_a_fisheye_has_no_tangential_distortion(scene, where):
+    values = {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "p1": 0.2, "p2": 0.1}
+    assert "p1 = 0.2, p2 = 0.1, which no fisheye has" in refusal(with_camera(scene, where, values))

@@ -20,6 +20,8 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import PENDING
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
@@ -253,3 +255,24 @@ def test_no_time_counts_while_the_viewer_has_the_run_paused(data, tmp_path):
     trainer = run(configure(data, tmp_path, steps=6), after_step=pause)
     assert trainer.pipeline.coordinator.state.step == 6
     assert trainer.pipeline.coordinator.stopwatch.seconds < time.monotonic() - began - waited
+
+
+@pytest.mark.parametrize("kind", ["user", "signal"])
+def test_what_goes_wrong_in_the_last_scoring_ends_the_run_at_once(data, tmp_path, monkeypatch, kind):
+    scored = []
+
+    def fails(self, outputs, batch):
+        scored.append(batch)
+        if kind == "user":
+            raise UserError("AlexNet's weights could not be fetched.")
+        signal.raise_signal(signal.SIGINT)
+        return score(self, outputs, batch)
+
+    score = AbcdModel.get_image_metrics_and_images
+    monkeypatch.setattr(AbcdModel, "get_image_metrics_and_images", fails)
+    config = configure(data, tmp_path, steps=4)
+    config.steps_per_eval_all_images = 1000
+    with pytest.raises(SystemExit) as ended:
+        run(config)
+    assert ended.value.code == (2 if kind == "user" else 130)
+    assert len(scored) == 1

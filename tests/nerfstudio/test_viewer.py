@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
+import torch
 import viser.transforms as vtf
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
@@ -250,3 +251,15 @@ def test_a_viewer_that_fails_does_not_end_the_run(data, tmp_path, monkeypatch, c
     trainer = run(config)
     assert trainer.pipeline.coordinator.state.step == len(errors)
     assert capsys.readouterr().out.count("iewer failed") == len(errors)
+
+
+def test_a_viewers_background_counts_only_where_the_run_leaves_it_open(watched, monkeypatch):
+    model, color = watched.trainer.pipeline.model, torch.tensor([0.1, 0.9, 0.2])
+    before = model.background_color
+    monkeypatch.setattr(model.config, "background_color", "white")
+    model.set_background(color)
+    assert model.background_color is before
+    monkeypatch.setattr(model.config, "background_color", "random")
+    model.set_background(color)
+    assert model.background_color is color
+    model.set_background(before)

@@ -72,6 +72,8 @@ def test_it_trains_as_ns_train_does(tmp_path):
         ({"photos": [torch.zeros(36, 48, 3), torch.zeros(36, 48, 4)]}, "Photo 1 has shape"),
         ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
         ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
+        ({"steps": 0}, "at least 1"),
+        ({"options": RunOptions(max_seconds=0.0)}, "above 0"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_is_written(tmp_path, change, says):

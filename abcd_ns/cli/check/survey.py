@@ -120,7 +120,9 @@ def look(source: PhotoSource) -> Look:
         with open_picture(source.path) as picture:
             turned, alpha = orientation(picture), has_alpha(picture)
             picture.draft("L", REDUCED)
-            brightness = ImageStat.Stat(picture.convert("L")).mean[0] / 255
+            mask = picture.convert("RGBA").getchannel("A").point(lambda a: 255 * (a > 127)) if alpha else None
+            visible = ImageStat.Stat(picture.convert("L"), mask)
+            brightness = visible.mean[0] / 255 if visible.count[0] else 0.0
     except (OSError, SyntaxError, ValueError) as error:
         return Look(0.0, error=str(undecodable(source.path, error)))
     return Look(brightness, turned, alpha)

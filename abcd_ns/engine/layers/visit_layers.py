@@ -1,7 +1,7 @@
 """The frozen layers around a block, for the views of one visit."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import add
 
@@ -59,14 +59,17 @@ class VisitLayers:
         self._windows: dict[int, ZWindow] = {}
         self._sum: Tensor | float = 0.0
 
-    def draw(self, views: Sequence[int]) -> Iterator[Kept]:
+    def draw(self, views: Sequence[int], alive: Callable[[], None] = lambda: None) -> Iterator[Kept]:
         """Draw F and B of these views and keep what there is room for; yields each when it is ready.
+
+        Args:
+            alive: called for each picture of a node, of which many come before the first view is ready.
 
         Raises:
             RuntimeError: when all are drawn, if some pixel is NaN or infinite.
         """
         for group in self._groups(views):
-            yield from self._draw_group(group)
+            yield from self._draw_group(group, alive)
         if not math.isfinite(self._sum):  # the one look at values: a device would be waited for at each
             block = self._geometry.block
             raise RuntimeError(
@@ -101,13 +104,14 @@ class VisitLayers:
     def _seen(self, view: int) -> Seen:
         return Seen(self._views[view], self._geometry.crops[view], self._windows.get(view))
 
-    def _draw_group(self, views: Sequence[int]) -> Iterator[Kept]:
+    def _draw_group(self, views: Sequence[int], alive: Callable[[], None]) -> Iterator[Kept]:
         """All nodes one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         seen = [self._seen(view) for view in views]
         parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
         for node in self._nodes:
             for one, part in zip(seen, self._draw_node(node, seen), strict=True):
+                alive()
                 view = one.view.index
                 parts[view][node] = part
                 self._renderer.fold_up(parts[view], node, one)

@@ -48,8 +48,13 @@ def layers_of_visit(
         backwards=active.number % 2 == 1,
     )
     wanted = tuple(dict.fromkeys(views))
-    for done, _ in enumerate(layers.draw(wanted), start=1):
-        run.announce(LayersDrawn(active.number, done, len(wanted)))
+    ready = 0
+
+    def tell() -> None:
+        run.announce(LayersDrawn(active.number, ready, len(wanted)))
+
+    for ready, _ in enumerate(layers.draw(wanted, tell), start=1):  # noqa: B007
+        tell()
     return layers
 
 

@@ -163,6 +163,9 @@ class RunState:
                 known[new] = copy.copy(known[parent])
         if (record := self.health.get(parent)) is not None:  # what was repaired is counted once
             self.health[new] = BlockHealth(visits=record.visits)
+        if self.active is not None:
+            shown = self.active.visible
+            shown |= {view: (*blocks, new) for view, blocks in shown.items() if parent in blocks}
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
             self.queue.insert(place + 1, self.queue[place]._replace(block=new))

@@ -44,6 +44,14 @@ def test_brightness_is_the_mean_luma(scene, kind):
     assert found.looks[sorted(NAMES).index(NAMES[0])].brightness == pytest.approx(expected, abs=0.01)
 
 
+def test_what_is_transparent_is_not_dark(scene):
+    picture = Image.new("RGBA", SIZES[0], (0, 0, 0, 0))
+    picture.paste((200, 200, 200, 255), (2, 2, 9, 9))
+    picture.save(scene / "images" / NAMES[0], format="PNG")
+    found = survey(scene, 1).looks[sorted(NAMES).index(NAMES[0])]
+    assert found.brightness == pytest.approx(200 / 255, abs=0.01)
+
+
 def test_exposure_that_varies_is_told_from_blank_photos(found, monkeypatch):
     evenly = [0.3 + 0.02 * i for i in range(len(NAMES))]
     assert not {"exposure", "blank-photos", "photos-beyond-ram"} & names(with_brightness(found, *evenly))

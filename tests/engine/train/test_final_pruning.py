@@ -115,6 +115,26 @@ def test_what_is_opaque_is_not_taken_for_what_does_not_show(complete):
     assert int((whole_scene(coordinator).opacities > 8).sum()) == opaque
 
 
+def test_black_things_are_missed_where_training_has_other_backgrounds(begin, photos):
+    """And where any picture is better without what was trained, a quarter of it stays."""
+    start = random_gaussians(120, seed=1, size=0.12)
+    start = replace(start, features_dc=0 * start.features_dc - 1.7, features_rest=0 * start.features_rest)
+    start.opacities[:] = 4.0
+
+    def black(view, crop):
+        return 0 * photos(view, crop)
+
+    left = {}
+    for color in ("random", "black"):
+        given = {"steps": 2, "target": lambda sample: (black(sample.view.index, sample.crop), None)}
+        coordinator = begin(color, start, background=color, **given)
+        told = listen(coordinator, PrunedAtEnd)
+        train(coordinator, black)
+        left[color] = told[0].gaussians
+    assert left["black"] <= 31
+    assert left["random"] > 60
+
+
 @pytest.mark.parametrize("density", [{"min_contribution": 0.0}, {"strategy": "off"}])
 def test_options_keep_everything(complete, density):
     coordinator, told = complete(steps=10, density=replace(STILL, **density))

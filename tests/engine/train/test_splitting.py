@@ -1,5 +1,7 @@
 """Blocks that outgrow their limit are cut in two: nothing lost, bounded, resumable."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from abcd_ns.engine.events import BlockSplit, VisitBegan, VisitEnded
@@ -53,11 +55,13 @@ def test_what_cannot_be_parted_is_left_as_it_is():
 def test_a_part_is_visited_next_to_the_block_it_came_from_and_has_had_its_visits():
     state = RunState(queue=[VisitPlan(0, 5), VisitPlan(1, 7)], views={0: 3, 1: 4}, influence={0: {2: 0.5}})
     state.health[0] = BlockHealth(visits=3, pruned=7)
+    state.active = SimpleNamespace(visible={4: (0, 1), 5: (1,)})
     state.inherit(2, 0)
     state.inherit(3, 1)
     assert state.queue == [VisitPlan(0, 5), VisitPlan(2, 5), VisitPlan(1, 7), VisitPlan(3, 7)]
     assert (state.views[2], state.views[3]) == (3, 4)
     assert state.influence == {0: {2: 0.5}, 2: {2: 0.5}}
+    assert state.active.visible == {4: (0, 1, 2, 3), 5: (1, 3)}
     state.influence[2][2] = 0.1
     assert state.influence[0][2] == 0.5
     assert state.health.keys() == {0, 2}

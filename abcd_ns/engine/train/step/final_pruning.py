@@ -27,13 +27,15 @@ from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
-from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.batch import Sample, Target, background
 from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 LOSS = 0.05
 """Of the mean PSNR of training views, dB, that it may cost."""
+MOST_PRUNED = 0.75
+"""Of all Gaussians, at most. Where no picture is better than what was trained, that would be all."""
 RANKING = 16
 """Views that a block was trained on, for each that Gaussians are ranked by: of a short run not all are."""
 MOST_RANKED = 256
@@ -97,10 +99,11 @@ class FinalPruning:
         costs = ranked.double().cumsum(0)
         views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
         before = after = self._psnr(scene, views, worth, -1.0, 0)
-        few, many, least, guess = 0, len(ranked) + 1, -1.0, LOSS
+        most = max(int(MOST_PRUNED * len(ranked)), 1)
+        few, many, least, guess = 0, most + 1, -1.0, LOSS
         for taken in range(ROUNDS):
-            suggested = min(int(torch.searchsorted(costs, guess)), len(ranked))
-            number = suggested if many > len(ranked) else (few + many) // 2
+            suggested = min(int(torch.searchsorted(costs, guess)), most)
+            number = suggested if many > most else (few + many) // 2
             if number <= few:
                 break
             tried = float(ranked[number - 1])
@@ -165,8 +168,11 @@ class FinalPruning:
         return float(torch.stack(found).mean())
 
     def _square(self, view: View, picture: Raster) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
-        """The squared error of a picture, summed over the pixels that count, and which these are."""
-        seen, photo, counts = self._whole.beside(view, picture.color.detach())
+        """The squared error of a picture, summed over the pixels that count, and which these are. It lies on
+        what training has behind it: on black alone, black things would not be missed."""
+        behind = background(self._run.config, view.index, 0).to(picture.color)
+        shown = picture.color.detach() + picture.transmittance.detach()[..., None] * behind
+        seen, photo, counts = self._whole.beside(view, shown, behind)
         return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts
 
     def _prune_block(self, block: int, worth: Float[Tensor, "n"], least: float) -> int:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.engine.render import Raster
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -53,7 +54,10 @@ class PoseRounds:
         run = self._run
         views = self._whole.views()
         steps: dict[int, Tensor] = {}
-        pictures = self._whole.pictures(views, run.scene)
+        scene = run.scene
+        if scene.is_active_as_a_whole:  # parted once, not for each block of each group
+            scene = MemoryScene(scene.tree, scene.everything(run.device))
+        pictures = self._whole.pictures(views, scene)
         for group in pictures.groups(views):
             run.announce(PhotosWanted(tuple(view.index for view in group)))
             judged: dict[int, tuple[Raster, Tensor]] = {}

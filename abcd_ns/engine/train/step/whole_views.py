@@ -39,10 +39,11 @@ class WholeViews:
         return WholePictures(renderer, RenderSettings(run.sh_degree, run.config.antialiased), room)
 
     def beside(
-        self, view: View, shown: Float[Tensor, "h w 3"]
+        self, view: View, shown: Float[Tensor, "h w 3"], behind: Float[Tensor, "3"] | None = None
     ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
-        """A picture on black in its photo's light, not clamped; the photo; 1 where pixels count, else 0."""
-        sample = Sample(view, view.full, None, None, shown.new_zeros(3))
+        """A picture on `behind`, None for black, in its photo's light, not clamped; the photo; 1 where pixels
+        count, else 0."""
+        sample = Sample(view, view.full, None, None, shown.new_zeros(3) if behind is None else behind)
         photo, counts = self._target(sample)
         light = self._run.light
         seen = shown if light is None else lit(shown, light.of(view.index).detach())
