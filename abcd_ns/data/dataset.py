@@ -46,16 +46,10 @@ class AbcdDataset(InputDataset):
         return self.photos.image(image_idx).numpy()
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """`image_idx`, `image` [H, W, 3 or 4] of the type asked for and, if any, `mask` bool [H, W, 1]. In
-        float32 transparent is white, as in `blender-data`: nerfstudio takes four channels for features."""
+        """`image_idx`, `image` [H, W, 3 or 4] of the type asked for and, if any, `mask` bool [H, W, 1]."""
         read = {"uint8": self.get_image_uint8, "float32": self.get_image_float32}[image_type]
         mask = self.photos.mask(image_idx)
-        image = read(image_idx)
-        if (
-            image_type == "float32" and image.shape[2] == 4
-        ):  # nerfstudio's tools show four channels as features
-            image = image[..., :3] * image[..., 3:] + (1 - image[..., 3:])
-        data = {"image_idx": image_idx, "image": image}
+        data = {"image_idx": image_idx, "image": read(image_idx)}
         return data if mask is None else data | {"mask": mask}
 
 
