@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.formats.levels import halved
+from abcd_ns.formats.levels import coarser
 from abcd_ns.formats.packed import MOST_SOG, packed
 from abcd_ns.formats.ply import GENERATOR
 
@@ -42,7 +42,7 @@ def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool =
             lods[str(level)] = {"file": len(files), "offset": 0, "count": len(gaussians)}
             files.append(f"{name}/meta.json")
             counts[level] += len(gaussians)
-            gaussians = halved(gaussians)
+            gaussians = coarser(gaussians)
         leaves.append({"bound": bound, "lods": lods})
     meta = {
         "version": 1,
@@ -69,7 +69,7 @@ def _leaves(gaussians: Gaussians) -> Iterator[Gaussians]:
 
 
 def _tree(nodes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Nodes by halves; each holds the bounds of what is below it."""
+    """A balanced binary tree of nodes; each holds the bounds of what is below it."""
     if len(nodes) == 1:
         return nodes[0]
     children = [_tree(nodes[: len(nodes) // 2]), _tree(nodes[len(nodes) // 2 :])]

@@ -317,7 +317,7 @@ class AbcdTrainer(Trainer):
         which = "where it was left" if start.pin is None else start.pin
         say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
         if self.config.pipeline.model.init_splats is not None:
-            say("--pipeline.model.init-splats begins a run only; this one goes on with its own Gaussians.")
+            say("--pipeline.model.init-splats begins a run only; this one resumes with its own Gaussians.")
 
     def _update_viewer_state(self, step: int) -> None:
         """As nerfstudio's, but a client that goes away, or sends nonsense, does not end the run."""
