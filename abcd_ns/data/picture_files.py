@@ -98,9 +98,10 @@ class FileFinder:
 def visible_files(folder: Path) -> Iterator[Path]:
     """All files below a folder, through links, too. Not what systems hide there: macOS's ._a.jpg, Synology's
     @eaDir."""
-    seen = set()
+    root, seen = Path(os.path.realpath(folder)), set[Path]()
     for at, folders, names in os.walk(folder, followlinks=True):
-        if (place := os.path.realpath(at)) in seen:  # a link that leads up again
+        place = Path(os.path.realpath(at))
+        if place in seen or place in root.parents:  # a link that leads there again, or up
             folders.clear()
             continue
         seen.add(place)

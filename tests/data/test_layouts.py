@@ -143,5 +143,6 @@ def test_folders_that_are_links_are_searched_and_loops_end(scene):
     (scene / "transforms.json").write_text(json.dumps(meta))
     (scene / "images").rename(scene.parent / "elsewhere")
     (scene / "images").symlink_to(scene.parent / "elsewhere")
-    (scene / "images" / "again").symlink_to(scene)
+    (scene / "images" / "again").symlink_to(scene / "images")
+    (scene / "images" / "everything").symlink_to("/")
     assert len(parser(scene).get_dataparser_outputs("train").image_filenames) > 0
