@@ -3,6 +3,7 @@
 import gzip
 import io
 import json
+import math
 import zipfile
 from collections.abc import Iterable
 
@@ -20,6 +21,8 @@ turn them back, but gaussforge 0.6 does not turn them."""
 MOST_SOG = 1 << 16
 """Gaussians with harmonics that gaussforge packs into a .sog in 7 s. Of more it shares them:
 70,000 took more than 6 minutes."""
+WIDEST_SPZ = math.exp(255 / 16 - 10)
+"""Units: the largest standard deviation that a .spz holds (nianticlabs/spz, README)."""
 BYTES_AT_ONCE = 1000  # of RAM that a Gaussian of degree 3 needs while it is packed (.spz), measured
 
 

@@ -1,5 +1,6 @@
 """`abcd export`: what an independent reader finds in the files is the scene."""
 
+import io
 import json
 import math
 from dataclasses import replace
@@ -19,6 +20,7 @@ from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
+from abcd_ns.formats.packed import WIDEST_SPZ
 from tests.reference.scenes import random_gaussians
 
 BLOCKS = 5
@@ -145,6 +147,18 @@ def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
     assert "--frame nerfstudio" in said
     tell_rounding(".ply", largest=5e6, size=0.0)  # a single Gaussian has no size to lose digits of
     assert capsys.readouterr().out == ""
+
+
+def test_sizes_that_spz_cuts_are_told_and_are_what_its_reader_finds(tmp_path, scene, capsys):
+    scene.scales[3] = 7.0
+    run = write_run(tmp_path / "run", scene)
+    export(run, out=tmp_path / "wide.spz", frame="nerfstudio")
+    assert (
+        f"up to {math.exp(7):,.0f} units wide, .spz holds {WIDEST_SPZ:.0f} at most" in capsys.readouterr().out
+    )
+    gaussforge = pytest.importorskip("gaussforge")
+    back = gaussforge.GaussForge().convert((tmp_path / "wide.spz").read_bytes(), "spz", "ply")["data"]
+    assert PlyData.read(io.BytesIO(back))["vertex"]["scale_0"].max() == pytest.approx(math.log(WIDEST_SPZ))
 
 
 def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):

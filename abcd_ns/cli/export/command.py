@@ -18,7 +18,7 @@ from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import Z_TO_Y
-from abcd_ns.formats.packed import BYTES_AT_ONCE, MOST_SOG
+from abcd_ns.formats.packed import BYTES_AT_ONCE, MOST_SOG, WIDEST_SPZ
 from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.formats.streamed import write_streamed
 from abcd_ns.progress_bar import tracked
@@ -63,7 +63,8 @@ def export(
         by_block: Write one file for each block.
         lod: Write streamed SOG, of which viewers load what they show, as coarse as its distance allows.
         box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
-        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
+        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json,
+            before the `applied_transform` that transforms.json may hold.
             "nerfstudio" has those of the run, its viewer and `ns-export`.
     """
     check_request(out, box)
@@ -160,6 +161,9 @@ def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffi
     if scene.faint:
         print(f"{many(scene.faint, 'Gaussian', 'Gaussians')} too transparent to be drawn left out.")
     tell_rounding(suffix, scene.largest, scene.size)
+    if suffix == ".spz" and scene.widest > WIDEST_SPZ:
+        lost = f"Of Gaussians, up to {scene.widest:,.0f} units wide, .spz holds {WIDEST_SPZ:.0f} at most"
+        print(f"{lost}: wider ones shrink. .sog and .ply keep them.")
     if scene.antialiased:
         print("Trained antialiased: enable antialiasing in the viewer, or thin things look too thick.")
 

@@ -1,5 +1,6 @@
 """Which of a stored scene's Gaussians are exported, and where they are."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,6 +59,8 @@ class Shown:
         self.antialiased: bool = self.store.header.get(MADE_FOR, {}).get("antialiased", False)
         self._corners = torch.zeros(0, 3, dtype=torch.float64)
         """The lowest and highest coordinates so far."""
+        self.widest = 0.0
+        """The largest standard deviation so far, in the units of the file."""
         self.faint = 0
         """Of those that were counted, how many no rasterizer draws."""
 
@@ -91,7 +94,9 @@ class Shown:
             return found
         exact = torch.cat((self._corners, self._placed(found.means)))
         self._corners = torch.stack((exact.amin(0), exact.amax(0)))
-        return found if self.to is None else self.to.gaussians(found)
+        found = found if self.to is None else self.to.gaussians(found)
+        self.widest = max(self.widest, math.exp(found.scales.max()))
+        return found
 
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
         """These parameters, the means among them, of the block's active Gaussians and of pending migrants."""

@@ -56,12 +56,16 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     assert narrower.tolist() == [[False, True, False]] * 5
 
 
-@pytest.mark.parametrize(("room", "added"), [(None, 30), (200, 30), (12, 12), (0, 0)])
-def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
+@pytest.mark.parametrize(
+    ("room", "visit", "added"),
+    [(None, None, 30), (200, None, 30), (12, None, 12), (0, None, 0), (None, 8, 120)],
+)
+def test_a_refinement_adds_at_most_a_tenth_or_of_a_block_among_others_more_best_first(room, visit, added):
     params, optimizers = activated(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
     before = params["means"].detach().clone()
-    control.after_step(params, optimizers, statistics(*range(100, 400)), (), (), clock(room=room))
+    given = statistics(*range(100, 400)), (), (), clock(room=room, visit=visit)
+    control.after_step(params, optimizers, *given)
     assert len(params["means"]) == 300 + added
     assert torch.equal(params["means"][: 300 - added], before[: 300 - added])  # the best are the last
 

@@ -38,8 +38,9 @@ USUAL_REFINEMENTS, USUAL_VIEWS = 20, 100
 USUALLY_SEEN = 0.4
 """... where a picture shows this share of its Gaussians or more. Where it shows less, they learn less from as
 many views, so that the block is refined less often."""
-MOST_NEW = 0.1
-"""Gaussians that one refinement may add, as a share of the block's; at least one."""
+MOST_NEW, MOST_NEW_OF_BLOCK = 0.1, 0.4
+"""Gaussians that one refinement may add, as a share of those that are trained; at least one. A block among
+others, which is refined about once a visit, may add more."""
 MANY_VIEWS = 25
 """Of fewer, what a Gaussian contributes sums up to less: the minimum is in proportion to them."""
 Infos = tuple[dict[str, Any], ...]
@@ -60,7 +61,8 @@ class DensityConfig:
     contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
     """Split a Gaussian if that removes as much squared error as this many average pixels have.
-    Both count in all views of its block. A refinement splits a tenth of the block at most."""
+    Both count in all views of its block. A refinement splits a tenth of the scene at most, in visits four
+    tenths of the block."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
@@ -108,8 +110,8 @@ class DensityClock:
     spent: float = 0.0
     """Share of the visit that is done; 0 in the warm-up and where there are no other blocks."""
     visit: int | None = None
-    """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
-    show it."""
+    """Views that the visit to a block among others draws; None for another. A block is refined once a visit
+    even if thousands of views show it."""
 
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
@@ -209,7 +211,7 @@ class DensityControl:
     ) -> dict[str, Tensor]:
         config = self.config
         wanted, axis = worth(growth, clock.views, config.split_pixels)
-        most = math.ceil(MOST_NEW * len(wanted))
+        most = math.ceil((MOST_NEW if clock.visit is None else MOST_NEW_OF_BLOCK) * len(wanted))
         room = most if clock.room is None else min(most, clock.room)
         growth = split_gaussians(params, optimizers, growth, chosen(wanted, room), axis)
         growth[WORTH] = torch.zeros_like(growth[WORTH])

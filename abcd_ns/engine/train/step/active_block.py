@@ -17,7 +17,7 @@ from abcd_ns.engine.train.density.pruning import contributions, faded, have_cont
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.run_state import ActiveVisit, VisitKind
 from abcd_ns.engine.types import Gaussians
 
 LARGEST = "largest"
@@ -174,14 +174,13 @@ class ActiveBlock:
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """What decides whether to refine, see `after_step`."""
         run, active = self._run, self._run.active
-        blocks = run.blocks
-        among_others = blocks > 1 and run.config.recipe.overlap == 0
+        among_others = run.blocks > 1 and run.config.recipe.overlap == 0
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
             taken=taken,
             views=len(active.trained_on),
-            visit=active.steps * batch if blocks > 1 else None,
+            visit=active.steps * batch if active.kind is VisitKind.BLOCK else None,
             room=room,
             refined=self.clocks.refined,
             first=among_others and self.clocks.visits == 0,
