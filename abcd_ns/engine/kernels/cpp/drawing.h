@@ -37,7 +37,8 @@ struct Place {  // of a picture's tiles
   int64_t first_tile;
 };
 
-struct Reach {  // a Gaussian that may be drawn, and the rows of tiles of its picture that it reaches
+struct alignas(64) Reach {  // a Gaussian that may be drawn, and the rows of tiles of its picture that it reaches
+  float record[RECORD];
   Bound bound;
   int32_t column, part, first_row, rows;
 };
@@ -74,6 +75,7 @@ static bool reaches(const float* planes, int64_t row, const Picture& p, int firs
   const float b = std::min({high, gsplat_last(y, radius), float(p.y + p.height - 1)});
   if (!(a <= b)) return false;
   found.first_row = int(a) / SIDE - first_row, found.rows = int(b) / SIDE - first_row + 1 - found.first_row;
+  Shape::record(planes, row, found.record);
   return true;
 }
 
@@ -139,9 +141,12 @@ static void fill(const Lists& lists, Band& band, std::vector<uint64_t>& keys) {
   };
   for (int id = 0; id < n; id++) {
     const Reach& reach = lists.reaches[band.reach[id]];
-    const Part& part = lists.parts[reach.part];
+    if (id + AHEAD < n) {
+      const Reach& next = lists.reaches[band.reach[id + AHEAD]];
+      __builtin_prefetch(next.record), __builtin_prefetch(&next.bound);
+    }
     float* r = &band.record[size_t(id) * RECORD];
-    Shape::record(part.planes + reach.column - lists.first_column[reach.part], part.row, r);
+    std::memcpy(r, reach.record, sizeof reach.record);
     if (lists.weighs) r[2] = 0;
     I first, count;
     tiles_of_rows(reach.bound, band.first_row + place.first_row, picture, first, count);
@@ -283,11 +288,10 @@ struct Light {
     for (int v = 0; v < VECTORS; v++) left[v] = splat(1), live[v] = tile.inside[v];
   }
   V pass(int v, V alpha) {  // its weight
-    const V takes = alpha * left[v];
-    live[v] &= left[v] - takes > splat(MIN_TRANSMITTANCE);
-    const V weight = only(live[v], takes);
-    left[v] -= weight;
-    return weight;
+    const V takes = alpha * left[v], after = left[v] - takes;
+    live[v] &= after > splat(MIN_TRANSMITTANCE);
+    left[v] = live[v] ? after : left[v];
+    return only(live[v], takes);
   }
   bool ends() const {
     I some = live[0];
@@ -408,6 +412,8 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
     picture.near = nullptr;  // the lists are within the window already
     const Image &grad = grads[band.picture], &picture_drawn = drawn[band.picture];
     sums[b].assign(band.reach.size() * Few::PADDED, 0.0f);
+    std::vector<char> counts(band.reach.size());
+    for (size_t j = 0; j < counts.size(); j++) counts[j] = lists.reaches[band.reach[j]].column < own;
     const Centers centers;
     Few few;
     for (int t = 0; t + 1 < int(band.start.size()); t++) {
@@ -431,9 +437,9 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
       }
       Light light(tile);
       for (int k = band.start[t]; k < band.walked[t]; k++) {
+        if (k + AHEAD < band.walked[t]) __builtin_prefetch(lists.record(band, band.id[k + AHEAD]));
         const int32_t id = band.id[k];
         const float* r = lists.record(band, id);
-        const bool counts = lists.reaches[band.reach[id]].column < own;
         I some = I{};
         for (int v = 0; v < VECTORS; v++) {
           const V alpha = alpha_at<Shape>(r, tile, centers, v), before = light.left[v];
@@ -447,7 +453,7 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
           few.grad[few.n][v] = only(light.live[v] & (alpha < splat(MAX_ALPHA)), -alpha * by_alpha);
           some |= weight > splat(0);
         }
-        if (!counts || !any(some)) continue;
+        if (!counts[id] || !any(some)) continue;
         few.id[few.n++] = id;
         if (few.n == LANES) few.add_up(band, tile, up, residual, sums[b].data());
       }

@@ -127,7 +127,7 @@ static inline float sum(V v) {
 #endif
 
 // Row j of the result is lane j of all rows.
-static inline void transpose(V* rows) {
+__attribute__((always_inline)) static inline void transpose(V* rows) {
   V next[LANES];
 #if defined(__AVX512F__)
 #pragma GCC unroll 16
