@@ -15,7 +15,7 @@ constexpr int SIDE = 4, PIXELS = SIDE * SIDE, VECTORS = PIXELS / LANES;
 constexpr int CHANNELS = 3, RESIDUAL = 4;
 constexpr int GROWTH = 10, ABSOLUTE = 2;  // sums of w f, w r, w r x, w r y; of |dL/dx|, |dL/dy|
 constexpr int64_t AT_ONCE = 4096;
-constexpr int AHEAD = 4;  // records are fetched so many before they are needed
+constexpr int AHEAD = 10;  // records are fetched so many before they are needed
 
 // Columns of planes that are drawn into one picture. As in Python, see cpu/native.py.
 struct Part {
