@@ -4,6 +4,7 @@ import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import torch
@@ -49,6 +50,8 @@ DataFormat = tyro.conf.OmitSubcommandPrefixes[
 ]
 """A subcommand for each of READERS; None by default."""
 
+SELECTED = 1024
+"""Training cameras that are kept, each by itself: selecting one takes nerfstudio 0.3 ms, in every step."""
 _TURNS = "each block takes its views in shuffled turns"
 _CHOICES = ("num_images_to_sample_from", "num_times_to_repeat_images", "image_indices")
 UNUSED = {
@@ -142,6 +145,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         with nullcontext() if reader_name(reader) == OUR_READER else reading(reader):
             super().__init__(config, *args, **kwargs)
         self._eval_order = random.Random(0)
+        cameras = self.train_dataset.cameras
+        self._camera = lru_cache(SELECTED)(lambda row: cameras[row : row + 1])
 
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
@@ -210,7 +215,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         self._parts = self._parts or list(self._coordinator.next_batch().parts())
         samples = self._parts.pop(0)
         rows = [sample.view.index for sample in samples.samples]
-        camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
+        camera = self._camera(rows[0])  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
         photos, masks = map(list, zip(*map(self.target, samples.samples), strict=True))
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
