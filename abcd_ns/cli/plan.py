@@ -48,7 +48,7 @@ PLACES = {
 """Where memory is needed, and the words for a lack of it, with the fix."""
 DAY = 24
 """Hours from which on a forecast names ways to take less."""
-LOST = {1 / 4: 1.2, 1 / 8: 2.4, 1 / 16: 3.5}
+LOST = {1 / 4: 0.9, 1 / 8: 2.0, 1 / 16: 3.3}
 """dB below one block, by the share of its memory for Gaussians that a block has. The most of four scenes, 160
 px wide (docs/results/README.md)."""
 LAYERS_BY_STEPS = 0.15
@@ -194,6 +194,7 @@ class Forecast:
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     """Cut the points into blocks, and time a step; UserError where the device has no room for any block."""
+    capture = _limited(capture, wanted.max_gaussians)
     points, views = capture.points, capture.views
     training = methods.abcd.config.pipeline.training
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -228,6 +229,14 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         },
         seconds_per_step=seconds,
     )
+
+
+def _limited(capture: Capture, most: int) -> Capture:
+    """As training begins: with a random choice where there are more points than Gaussians are allowed."""
+    if not 0 < most < len(capture.points):
+        return capture
+    rows = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
+    return replace(capture, points=capture.points[rows], colors=capture.colors[rows])
 
 
 def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:

@@ -1,6 +1,7 @@
 """What a run is given: a method, a seed, and what all runs of a folder share."""
 
 import re
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,6 +22,8 @@ HELD_OUT_EVERY = 8
 """One view in so many is never trained on: 0, 8, 16, ... of the list sorted by name, as in the papers of the
 field, or a sector."""
 HoldOut = Literal["auto", "interval", "sector"]
+LONGEST = 200
+"""Bytes of a folder's name; file systems take 255, and the seed follows."""
 AS_IT_IS = "default"
 """Name of the variant without changes."""
 
@@ -118,6 +121,8 @@ class Job:
     def folder(self, out: Path) -> Path:
         """Where the run is kept; nerfstudio's layout of output_dir/experiment/method/timestamp."""
         parts = [re.sub(r"[^\w.=+-]+", "_", self.variant)] if self.changes else []
+        if parts and len(parts[0].encode()) > LONGEST:
+            parts = [f"{parts[0][: LONGEST // 4]}-{zlib.crc32(self.variant.encode()):08x}"]
         return out / "runs" / self.method / "-".join([*parts, f"seed-{self.seed}"])
 
 
@@ -143,3 +148,5 @@ class Plan:
     first seed first."""
     command: str
     """The command line that makes the same."""
+    scene: str | None = None
+    """By what the data are known again; None for those of a terrain, or where nobody looked."""

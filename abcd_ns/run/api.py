@@ -1,6 +1,7 @@
 """Training and rendering from Python: the engine without nerfstudio."""
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -32,6 +33,8 @@ LOG = logging.getLogger("abcd_ns")
 
 Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]
 """0..255 as integers, or 0..1."""
+BRIGHTEST = 2.0
+"""Of real numbers that are taken for 0..1; some filters go beyond 1."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,14 @@ def train(
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     training, (places, colors) = options.training, points
     _check(views, photos, steps, options, device, folder)
+    if not 0 < len(places) == len(colors):
+        raise UserError(f"There are {len(places)} points and {len(colors)} colours: give one for each.")
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
 
     def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         pixels = photos[index][crop.slices]
-        return (pixels if pixels.is_floating_point() else pixels.float() / 255).to(device)
+        return (pixels.float() if pixels.is_floating_point() else pixels.float() / 255).to(device)
 
     def target(sample: Sample) -> Target:
         return sample.reduced(photo(sample.view.index, sample.source)), None
@@ -137,6 +142,9 @@ def _check(
     folder: Path,
 ) -> None:
     options.training.check()
+    for name in ("blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb", "workers"):
+        if not 0 <= (value := getattr(options, name)) < math.inf:
+            raise UserError(f"options.{name} must be 0 or more and finite, not {value}.")
     if steps < 1 or (options.max_seconds is not None and not options.max_seconds > 0):
         raise UserError("steps must be at least 1, and options.max_seconds above 0.")
     if manifest_path(folder).exists():
@@ -147,5 +155,7 @@ def _check(
         if tuple(photos[index].shape) != (view.height, view.width, 3):
             wanted, shape = [view.height, view.width, 3], list(photos[index].shape)
             raise UserError(f"Photo {index} has shape {shape}, but its view has {wanted}.")
+        if photos[index].is_floating_point() and not float(photos[index].max()) <= BRIGHTEST:
+            raise UserError(f"Photo {index} is no picture of 0..1: give integers, or divide by 255.")
     if options.cluster is not None or (options.workers > 1 and not can_fork(device)):
         raise UserError("Workers on GPUs or a cluster need ns-train: leave out workers and cluster.")

@@ -164,3 +164,12 @@ def test_options_out_of_range_are_refused(tmp_path):
             plan(tmp_path, wanted)
     with pytest.raises(UserError, match="--downscale is 0"):
         plan(tmp_path, Wanted(), downscale=0)
+
+
+def test_a_limit_below_the_points_is_what_training_begins_with(capsys):
+    found = planned(Wanted(blocks=2, max_gaussians=100))
+    assert sum(found.points_of_block) == 100
+    low, high = found.hours
+    assert low == high
+    print_forecast(found, Console(width=120))
+    assert "100 points to begin with, 100 expected" in capsys.readouterr().out

@@ -72,6 +72,13 @@ def test_it_trains_as_ns_train_does(tmp_path):
         ({"photos": [torch.zeros(36, 48, 3), torch.zeros(36, 48, 4)]}, "Photo 1 has shape"),
         ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
         ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
+        ({"photos": [torch.full((36, 48, 3), 200.0)] * 2}, "Photo 0 is no picture of 0..1"),
+        ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
+        ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
+        ({"options": RunOptions(blocks=-1)}, "blocks must be 0 or more"),
+        ({"options": RunOptions(near_plane=-1.0)}, "near_plane must be 0 or more"),
+        ({"options": RunOptions(workers=-2)}, "workers must be 0 or more"),
+        ({"options": RunOptions(device_budget_gb=float("nan"))}, "device_budget_gb must be 0 or more"),
         ({"steps": 0}, "at least 1"),
         ({"options": RunOptions(max_seconds=0.0)}, "above 0"),
     ],
@@ -85,3 +92,13 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(tmp_path, chang
     with pytest.raises(UserError, match=says):
         train(ring_of_views(2), out=tmp_path / "out", **given)
     assert not (tmp_path / "out").exists()
+
+
+def test_photos_of_double_precision_train_as_those_of_single(tmp_path):
+    """What numpy makes of a photo divided by 255."""
+    views, points = ring_of_views(3), (torch.rand(9, 3) - 0.5, torch.zeros(9, 3))
+    photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(k)) for k in range(3)]
+    single = train(views, photos, points, tmp_path / "single", steps=2)
+    double = train(views, [photo.double() for photo in photos], points, tmp_path / "double", steps=2)
+    for (_, one), (_, other) in zip(single.gaussians.items(), double.gaussians.items(), strict=True):
+        assert torch.equal(one, other)

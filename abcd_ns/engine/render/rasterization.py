@@ -26,6 +26,10 @@ FIXED = {
     "covars": None,
 }
 """gsplat's other arguments and the one value that each may have: gsplat's default, but for `packed`."""
+WORDS = {
+    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+    "rasterize_mode": ("classic", "antialiased"),
+}
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-7
 """Gaussians are kept before activation, which maps 0 to infinity."""
 
@@ -82,7 +86,8 @@ def rasterization(
         ValueError: an argument has a value that is not supported.
         TypeError: gsplat has no such argument.
     """
-    _check(colors, sh_degree, fixed)
+    _check(colors, sh_degree, fixed, render_mode=render_mode, rasterize_mode=rasterize_mode)
+    _check_alike(means, quats, scales, opacities, colors)
     gaussians = _before_activation(means, quats, scales, opacities, colors)
     cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
@@ -110,15 +115,30 @@ def _channels(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
     return raster.color, 1 - raster.transmittance[..., None], raster.depth[..., None]
 
 
-def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any]) -> None:
+def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any], **words: str) -> None:
     for name, value in fixed.items():
         if name not in FIXED:
             raise TypeError(f"rasterization has no argument {name}.")
         if value != FIXED[name]:
             raise ValueError(f"{name}={value} is not supported here: leave it out.")
+    for name, value in words.items():
+        if value not in WORDS[name]:
+            raise ValueError(f"{name} must be one of {', '.join(WORDS[name])}, not {value}.")
     if colors.shape[-1] != 3 or colors.ndim != (2 if sh_degree is None else 3):
         wanted = "[n, 3]" if sh_degree is None else "[n, k, 3]"
         raise ValueError(f"colors must be {wanted}, not {list(colors.shape)}.")
+
+
+def _check_alike(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> None:
+    """Raise ValueError unless there is one of each for each Gaussian, in one dtype and on one device: the
+    native library reads memory by the means' number and type."""
+    shapes = {"means": (means, 3), "quats": (quats, 4), "scales": (scales, 3), "opacities": (opacities,)}
+    for name, (value, *size) in {**shapes, "colors": (colors, *colors.shape[1:])}.items():
+        if list(value.shape) != [len(means), *size]:
+            raise ValueError(f"{name} must be {[len(means), *size]}, not {list(value.shape)}.")
+        if (value.dtype, value.device) != (means.dtype, means.device) or not value.is_floating_point():
+            kind = f"{name} are {value.dtype} on {value.device}, and means {means.dtype} on {means.device}"
+            raise ValueError(f"{kind}: give all as one floating-point type, on one device.")
 
 
 def _before_activation(

@@ -143,7 +143,7 @@ def compare(
     if plan.kind != TERRAIN:
         for job in plan.jobs:
             check_options(job)
-        check_scene(plan.jobs[0])
+        plan = dataclasses.replace(plan, scene=check_scene(plan.jobs[0]))
     console = Console()
     if options.budgets:
         *_, ceilings = run_jobs(plan, console, overwrite)
@@ -179,6 +179,8 @@ def make_plan(options: Options) -> Plan:
     given = dataclasses.replace(given, methods=tuple(m for m in METHODS if m in given.methods))
     if given.tiles is not None:
         return _terrain_plan(given)
+    if others := {"tile_gaussians", "visits"} & given.given.keys():
+        raise UserError(f"--{min(others).replace('_', '-')} goes with --tiles only.")
     if given.budgets is not None:
         return _budgets_plan(given, options)
     settings, arms = _settings(given), arms_of(given)
@@ -186,7 +188,7 @@ def make_plan(options: Options) -> Plan:
         Job(method, seed, settings, changes)
         for seed in given.seeds
         for method in given.methods
-        for changes in dict.fromkeys(_for_method(changes, method, settings) for changes in arms)
+        for changes in dict.fromkeys(_for_method(changes, method) for changes in arms)
     )
     return Plan("comparison", settings, Path(given.out), jobs, _command(given))
 
@@ -300,11 +302,11 @@ def _settings(given: Options) -> Settings:
     )
 
 
-def _for_method(changes: tuple[str, ...], method: str, settings: Settings) -> tuple[str, ...]:
+def _for_method(changes: tuple[str, ...], method: str) -> tuple[str, ...]:
     """What of an arm applies to a method: one block is one block, and splatfacto has its own options."""
     if method in ALONE:
         return ()
-    if method == "abcd-monolithic" and not settings.blocks:
+    if method == "abcd-monolithic":
         return tuple(change for change in changes if not change.startswith("blocks="))
     return changes
 

@@ -105,11 +105,11 @@ def _of_arms(arms: Sequence[Arm], labels: Mapping[str, str]) -> str:
 def _of_growth(results: Results) -> tuple[str, ...]:
     """Of ABCD's peak memory, from the smallest terrain to the largest."""
     arms, said = results.of("abcd"), []
+    if len(arms) < 2:
+        return ()
     for name, field in (("peak RAM grows", "peak_rss_bytes"), ("GPU memory", "peak_device_bytes")):
         sizes = [getattr(arm.runs[0], field) for arm in arms]
         said += [f"{name} by {sizes[-1] / sizes[0] - 1:.1%}"] if all(sizes) else []
-    if len(arms) < 2:
-        return ()
     grown = f"From {arms[0].value} to {arms[-1].value} blocks of ABCD, {', '.join(said)}"
     return (f"{grown}; allowed: {GOAL_GROWTH:.0%}.",)
 
@@ -189,6 +189,8 @@ def notes(results: Results) -> list[str]:
     if any(results.baseline(arm) for arm in results.arms):
         found.append("Differences are those of merged PSNR to the method as it is, taken seed by seed.")
         found += ["One seed: a few tenths of a dB may be chance."] if len(results.seeds) == 1 else []
+    if len({run.versions for run in results.runs}) > 1:
+        found.append("Runs are of several versions, see results.json: differences may be due to that.")
     found += results.notes
     found += [f"{left.method} is left out: {left.reason}." for left in results.left_out]
     for failure in results.failures:

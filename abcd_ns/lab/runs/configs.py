@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import zlib
 from pathlib import Path
 
 import torch
@@ -48,9 +49,11 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
     return config
 
 
-def check_scene(job: Job) -> None:
-    """Raise a UserError if the scene cannot be trained on, photos included."""
-    inspect(_parser(job))
+def check_scene(job: Job) -> str:
+    """By what the scene is known again, in words; a UserError if it cannot be trained on, photos included."""
+    found = inspect(_parser(job))
+    points = f"{len(found.cloud)} points of checksum {zlib.crc32(found.cloud.tobytes()):08x}"
+    return f"{found.train} views, {found.held_out} held out, {points}"
 
 
 def check_options(job: Job) -> None:

@@ -20,6 +20,7 @@ PREFIX = "pipeline."
 _SCORED = "it would change the photos that scores are taken from"
 FIXED = {
     "max_seconds": "set it with --seconds",
+    "device_budget_gb": "it has no effect where the number of blocks is given; see --budgets",
     "training.seed": "set it with --seeds",
     "datamanager.data": "set it with --data",
     "datamanager.dataparser.data": "set it with --data",

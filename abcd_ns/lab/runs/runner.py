@@ -28,6 +28,8 @@ from abcd_ns.lab.results.tables import TABLE_FILE, findings_of, write_table
 from abcd_ns.machine import Machine, describe_machine, describe_versions, peak_device_bytes, peak_rss_bytes
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
+SCENE = "photos and points"
+"""Of the scene, in the file by which a folder is known."""
 OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
 """How torch and CUDA say it, in the last line of a log."""
 MOST_IN_ONE_BLOCK = 4_000_000
@@ -44,7 +46,8 @@ def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[
         UserError: the folder holds something else, or runs that cannot be compared with these.
     """
     machine, found, left_out = describe_machine(), [], {}
-    claim(plan.out, plan.kind, {**encode(plan.settings), **encode(machine)}, overwrite)
+    shared = {**encode(plan.settings), SCENE: plan.scene, **encode(machine)}
+    claim(plan.out, plan.kind, shared, overwrite)
     for number, job in enumerate(plan.jobs, start=1):
         if job.method in left_out:
             continue
@@ -132,7 +135,10 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
         elif marker.exists():
             theirs = read_json(marker)
             for name, new in shared.items():
-                if (old := theirs.get(name) if isinstance(theirs, dict) else None) != new:
+                old = theirs.get(name) if isinstance(theirs, dict) else None
+                if name == SCENE and None in (old, new):
+                    continue  # older folders do not say
+                if old != new:
                     raise UserError(
                         f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
                         "compared; name another folder, or drop them with --overwrite."

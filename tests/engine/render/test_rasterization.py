@@ -1,6 +1,8 @@
 """The public `rasterization`, by gsplat 1.4.0's signature, against the naive twin and on a device."""
 
 import inspect
+import subprocess
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -126,6 +128,36 @@ def test_what_is_not_supported_is_refused_in_one_line(options, kind, says):
     with pytest.raises(kind, match=says) as refused:
         drawn(random_gaussians(3), **options)
     assert "\n" not in str(refused.value)
+
+
+REFUSED = """
+import torch
+from abcd_ns import rasterization
+
+def says(**change):
+    given = {"means": torch.ones(3, 3), "quats": torch.ones(3, 4), "scales": torch.ones(3, 3)}
+    given |= {"opacities": torch.ones(3), "colors": torch.ones(3, 3), **change}
+    try:
+        rasterization(**given, viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=8, height=8)
+    except ValueError as error:
+        return str(error)
+
+assert "quats must be [3, 4], not [3, 3]" in says(quats=torch.ones(3, 3))
+assert "scales must be [3, 3], not [3, 1]" in says(scales=torch.ones(3, 1))
+assert "opacities must be [3], not [2]" in says(opacities=torch.ones(2))
+assert "colors must be [3, 3], not [2, 3]" in says(colors=torch.ones(2, 3))
+assert "scales are torch.float64 on cpu" in says(scales=torch.ones(3, 3).double())
+assert "colors are torch.float16 on cpu" in says(colors=torch.ones(3, 3).half())
+assert "render_mode must be one of RGB, D" in says(render_mode="depth")
+assert "rasterize_mode must be one of classic, antialiased, not aa" in says(rasterize_mode="aa")
+"""
+
+
+def test_what_would_be_read_as_something_else_is_refused():
+    """The native library takes addresses: it would read past a tensor's end, or its bytes as float32. In a
+    process of its own, for here types are checked."""
+    done = subprocess.run([sys.executable, "-c", REFUSED], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.skipif(library() is None, reason="no C++ compiler")

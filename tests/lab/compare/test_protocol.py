@@ -47,6 +47,9 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"methods": ("abcd", "abcd")}, "each once"),
         ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
         ({"seeds": (1, 1)}, "different numbers"),
+        ({"visits": 5}, "--visits goes with --tiles only"),
+        ({"tile_gaussians": 9}, "--tile-gaussians goes with --tiles only"),
+        ({"vary": ("device-budget-gb=1",)}, "no effect where the number of blocks is given"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, given, message):
@@ -91,6 +94,25 @@ def test_changes_are_arms_beside_the_method_as_it_is(tmp_path):
     assert configs[1].training.density.min_contribution == 0.5
     assert [c.blocks for c in configs] == [4, 4, 27]
     assert "--vary training.density.min_contribution=0.5 'partition=grid blocks=27'" in plan.command
+
+
+def test_one_block_is_one_block_whatever_the_arm(tmp_path):
+    methods, vary = ("abcd-monolithic", "abcd"), ("blocks=27", "partition=grid blocks=9")
+    plan = make_plan(options(tmp_path, methods=methods, vary=vary))
+    found = [(j.method, j.variant, trainer_config(j, tmp_path).pipeline.blocks) for j in plan.jobs]
+    alone = [("abcd-monolithic", name, 1) for name in ("default", "partition=grid")]
+    assert found == [*alone, ("abcd", "default", 8), ("abcd", vary[0], 27), ("abcd", vary[1], 9)]
+
+
+def test_a_change_of_many_options_has_a_folder_of_its_own_that_disks_take(tmp_path):
+    names = "min_contribution", "split_pixels", "refine_start", "refine_stop", "cull_alpha_thresh"
+    long = (
+        " ".join(f"training.density.{name}=0.25" for name in names) + " training.warmup=0.2 training.batch="
+    )
+    plan = make_plan(options(tmp_path, vary=(f"{long}1", f"{long}2")))
+    folders = {job.folder(tmp_path) for job in plan.jobs}
+    assert len(folders) == 3
+    assert all(len(folder.name) < 255 for folder in folders)
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,14 @@ def test_another_protocol_or_machine_is_refused_by_name_until_overwritten(plan, 
         run(other)
 
 
+@pytest.mark.usefixtures("worker")
+def test_photos_and_points_that_changed_are_refused(plan):
+    for scene in ("12 views", None, "12 views"):  # older folders do not say
+        run(dataclasses.replace(plan, scene=scene))
+    with pytest.raises(UserError, match="holds runs with photos and points 12 views, not 11 views"):
+        run(dataclasses.replace(plan, scene="11 views"))
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     plan.out.mkdir()
