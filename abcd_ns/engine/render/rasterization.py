@@ -87,7 +87,6 @@ def rasterization(
         TypeError: gsplat has no such argument.
     """
     _check(colors, sh_degree, fixed, render_mode=render_mode, rasterize_mode=rasterize_mode)
-    _check_alike(means, quats, scales, opacities, colors)
     gaussians = _before_activation(means, quats, scales, opacities, colors)
     cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
@@ -144,6 +143,7 @@ def _check_alike(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor
 def _before_activation(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> Gaussians:
+    _check_alike(means, quats, scales, opacities, colors)
     if colors.ndim == 2:
         colors = ((colors - 0.5) / SH_C0)[:, None]
     return Gaussians(
