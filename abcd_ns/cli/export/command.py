@@ -63,8 +63,8 @@ def export(
         by_block: Write one file for each block.
         lod: Write streamed SOG, of which viewers load what they show, as coarse as its distance allows.
         box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
-        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json,
-            before the `applied_transform` that transforms.json may hold.
+        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
+            Where transforms.json holds an `applied_transform`, those before it.
             "nerfstudio" has those of the run, its viewer and `ns-export`.
     """
     check_request(out, box)
