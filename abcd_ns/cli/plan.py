@@ -19,7 +19,7 @@ from abcd_ns import methods
 from abcd_ns.arguments import Number, check_ranges
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.cluster.dispatcher import SLACK
-from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, thin_points
+from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
 from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
@@ -194,9 +194,9 @@ class Forecast:
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     """Cut the points into blocks, and time a step; UserError where the device has no room for any block."""
-    capture = _limited(capture, wanted.max_gaussians)
-    points, views = capture.points, capture.views
     training = methods.abcd.config.pipeline.training
+    capture = _limited(capture, wanted.max_gaussians, training.seed)
+    points, views = capture.points, capture.views
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pixels = max(view.full.pixels for view in views)
     most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
@@ -231,11 +231,11 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     )
 
 
-def _limited(capture: Capture, most: int) -> Capture:
-    """As training begins: with a random choice where there are more points than Gaussians are allowed."""
+def _limited(capture: Capture, most: int, seed: int) -> Capture:
+    """With the points that training begins with, where there are more than Gaussians are allowed."""
     if not 0 < most < len(capture.points):
         return capture
-    rows = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
+    rows = shuffled(len(capture.points), seed)[:most]
     return replace(capture, points=capture.points[rows], colors=capture.colors[rows])
 
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int64, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -125,12 +125,17 @@ def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     return torch.cat([torch.from_numpy(np.maximum(part, least)).to(points.dtype) for part in found])
 
 
+def shuffled(count: int, seed: int) -> Int64[Tensor, "n"]:
+    """The rows of so many points in the order in which a limit on Gaussians keeps them."""
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+
+
 def split_off(points: Points, keep: int, seed: int) -> tuple[Points, Points]:
     """A random `keep` of the points, widened to fill the gaps, and the others; all where there are no more.
     A seed always makes the same choice."""
     if keep >= len(points):
         return points, points[:0]
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+    order = shuffled(len(points), seed)
     chosen, others = points[order[:keep].sort().values], points[order[keep:].sort().values]
     wide = torch.maximum(chosen.scales, spacing(chosen.means).log_()[:, None])
     return replace(chosen, scales=wide), others

@@ -142,9 +142,6 @@ def test_notes_say_what_is_missing_and_why():
         assert part in text
 
 
-# Pictures
-
-
 def test_runs_of_several_versions_are_told():
     old = made_up_run("abcd-monolithic")
     old = dataclasses.replace(old, versions=dataclasses.replace(old.versions, commit="0123456789"))
@@ -154,6 +151,9 @@ def test_runs_of_several_versions_are_told():
 
 def test_growth_with_size_is_said_of_two_sizes_and_more():
     assert findings_of(dataclasses.replace(made_up_results(), kind=TERRAIN)) == ()
+
+
+# Pictures
 
 
 def test_every_view_that_all_runs_drew_gets_a_figure_of_photo_and_pictures(tmp_path):
