@@ -57,17 +57,30 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("room", "visit", "added"),
-    [(None, None, 30), (200, None, 30), (12, None, 12), (0, None, 0), (None, 8, 120)],
+    ("room", "added"),
+    [(None, 30), (200, 30), (12, 12), (0, 0)],
 )
-def test_a_refinement_adds_at_most_a_tenth_or_of_a_block_among_others_more_best_first(room, visit, added):
+def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
     params, optimizers = activated(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
     before = params["means"].detach().clone()
-    given = statistics(*range(100, 400)), (), (), clock(room=room, visit=visit)
+    given = statistics(*range(100, 400)), (), (), clock(room=room)
     control.after_step(params, optimizers, *given)
     assert len(params["means"]) == 300 + added
     assert torch.equal(params["means"][: 300 - added], before[: 300 - added])  # the best are the last
+
+
+def test_a_block_among_others_may_add_a_tenth_for_each_refinement_that_it_went_without():
+    """In its first visit twice as many; where a picture shows half as much as usual, half as many."""
+    control = DensityControl(DensityConfig(refine_every=50))
+
+    def most(drawn: int, **changes) -> float:
+        return control.most_new(clock(steps=1000, refined=1000 - drawn, **{"visit": 80, **changes}), 1.0)
+
+    shares = [most(150, visit=None), most(10), most(50), most(100), most(100, first=True), most(5000)]
+    assert shares == pytest.approx([0.1, 0.1, 0.1, 0.21, 1.1**4 - 1, 1.0])
+    usual, at = DensityControl(DensityConfig()), clock(steps=1000, progress=0.1, refined=800, visit=80)
+    assert [usual.most_new(at, seen) for seen in (0.8, 0.2)] == pytest.approx([0.21, 0.1])
 
 
 def test_without_room_nothing_is_added_but_the_transparent_go_and_the_large_stay():

@@ -38,9 +38,9 @@ USUAL_REFINEMENTS, USUAL_VIEWS = 20, 100
 USUALLY_SEEN = 0.4
 """... where a picture shows this share of its Gaussians or more. Where it shows less, they learn less from as
 many views, so that the block is refined less often."""
-MOST_NEW, MOST_NEW_OF_BLOCK = 0.1, 0.4
+MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of those that are trained; at least one. A block among
-others, which is refined about once a visit, may add more."""
+others is refined about once a visit, and may add a tenth for each refinement that it went without."""
 MANY_VIEWS = 25
 """Of fewer, what a Gaussian contributes sums up to less: the minimum is in proportion to them."""
 Infos = tuple[dict[str, Any], ...]
@@ -61,8 +61,8 @@ class DensityConfig:
     contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
     """Split a Gaussian if that removes as much squared error as this many average pixels have.
-    Both count in all views of its block. A refinement splits a tenth of the scene at most, in visits four
-    tenths of the block."""
+    Both count in all views of its block. A refinement splits a tenth of the scene at most. In visits a
+    block makes up for refinements that it went without."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
@@ -133,14 +133,32 @@ class DensityControl:
     def _every(self, clock: DensityClock, seen: float) -> int:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
-        pace = clock.steps / max(clock.progress, 1e-9)  # of the whole run, if it goes on as it has so far
-        growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * pace
-        given, usual = self.config.refine_every, min(USUAL_VIEWS, int(growing / USUAL_REFINEMENTS))
-        wanted = max(views, 0 if given else int(usual * USUALLY_SEEN / max(seen, 1e-9)))
-        every = max(given or usual, min(wanted, int(growing / LEAST_REFINEMENTS)), 1)
+        usual = self._usual(clock, 1.0)
+        wanted = max(views, self._usual(clock, seen))
+        every = max(usual, min(wanted, int(self._growing(clock) / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
+
+    def _usual(self, clock: DensityClock, seen: float) -> int:
+        """Views between refinements of a block that few views show."""
+        if self.config.refine_every:
+            return self.config.refine_every
+        usual = min(USUAL_VIEWS, int(self._growing(clock) / USUAL_REFINEMENTS))
+        return int(usual * max(USUALLY_SEEN / max(seen, 1e-9), 1.0))
+
+    def _growing(self, clock: DensityClock) -> float:
+        """Views that train the block while it grows, if the run goes on as it has so far."""
+        pace = clock.steps / max(clock.progress, 1e-9)
+        return max(self._ends(clock.first) - self.config.refine_start, 0.0) * pace
+
+    def most_new(self, clock: DensityClock, seen: float) -> float:
+        """Share of its Gaussians that a refinement may add."""
+        if clock.visit is None:
+            return MOST_NEW
+        missed = (clock.steps - clock.refined) / max(self._usual(clock, seen), 1)
+        missed *= 2 if clock.first else 1  # all it has is what the warm-up had room for
+        return min((1 + MOST_NEW) ** max(missed, 1.0) - 1, 1.0)
 
     def asks(self, progress: float, first: bool) -> bool:
         """Whether growth is under way or to come: residuals are summed for it. See DensityClock."""
@@ -211,7 +229,7 @@ class DensityControl:
     ) -> dict[str, Tensor]:
         config = self.config
         wanted, axis = worth(growth, clock.views, config.split_pixels)
-        most = math.ceil((MOST_NEW if clock.visit is None else MOST_NEW_OF_BLOCK) * len(wanted))
+        most = math.ceil(self.most_new(clock, share_seen(growth)) * len(wanted))
         room = most if clock.room is None else min(most, clock.room)
         growth = split_gaussians(params, optimizers, growth, chosen(wanted, room), axis)
         growth[WORTH] = torch.zeros_like(growth[WORTH])
