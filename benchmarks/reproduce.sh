@@ -2,7 +2,7 @@
 # Trains what docs/results/README.md claims of scenes, one core a run.
 #
 #   DATA=FOLDER benchmarks/reproduce.sh            lists the rows and how long they take
-#   DATA=FOLDER benchmarks/reproduce.sh NAME ...   takes those whose names begin so; `all` takes all
+#   DATA=FOLDER benchmarks/reproduce.sh NAME ...   takes these, or all of a folder; `all` takes all
 #
 # FOLDER has the scenes. Needs a clean commit and an idle core. Stopped, the same command goes on. In the
 # end the results are in docs/results, its tables are made anew, and a test compares numbers in texts.
@@ -59,7 +59,7 @@ with_12_photos() { # of those that are not held out, evenly spaced
 take() {
     local name=$1 data=$DATA/$3 reduction=$4 wanted
     for wanted in $asked; do
-        [[ $wanted == all || $name == "$wanted"* ]] || continue
+        [[ $wanted == all || $name == "$wanted" || $name == "$wanted"/* ]] || continue
         [[ $3 != *-12 ]] || data=$(with_12_photos "$3")
         abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures 0 --out "$out/$name"
     done
