@@ -30,12 +30,10 @@ from abcd_ns.engine.gaussians.initialize import PointCloud
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
-from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.coarse_model import stored_blocks
-from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError, Visits
@@ -71,35 +69,32 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
     return Box(cell.lower - margin, cell.upper + margin)
 
 
-class Surfaces:
-    """How far the initial points are at every pixel of every view, drawn at once; 4 bytes of RAM for each."""
-
-    def __init__(self, scene: StoredScene, views: list[View], rasterizer: Rasterizer, device: torch.device):
-        self._views = {view.index: view for view in views}
-        gaussians = Gaussians.cat([scene.stored(initial_of(b)) for b in range(scene.tree.num_blocks)])
-        opaque = math.log(SURFACE_OPACITY / (1 - SURFACE_OPACITY))
-        scales = gaussians.scales + math.log(SURFACE_SCALE)
-        opacities = torch.full_like(gaussians.opacities, opaque)
-        points = replace(gaussians, opacities=opacities, scales=scales).to(device)
-        self._depths = {index: depth_of(points, view, rasterizer) for index, view in self._views.items()}
-
-    def region(self, view: int, cell: Box) -> UInt8[Tensor, "h w"]:
-        """What every pixel of `view` is to a block with this cell: OWN, CLEAR or 0."""
-        camera = self._views[view]
-        depth = self._depths[view].to(camera.viewmat)
-        span = ray_interval(cell, camera, TileGrid(camera.full, 1))
-        near, far = (plane.view_as(depth) for plane in (span.near, span.far))
-        own = (near <= depth) & (depth < far)
-        hidden = (depth < near) & near.isfinite()
-        return (OWN * own + CLEAR * (~own & ~hidden)).to(torch.uint8)
-
-
 @torch.no_grad()
-def depth_of(points: Gaussians, view: View, rasterizer: Rasterizer) -> Float[Tensor, "h w"]:
-    """How far the surface is at every pixel; BEYOND where points cover less than half of it."""
-    raster = rasterizer(points, view, sh_degree=0)
-    alpha = 1 - raster.transmittance
-    return torch.where(alpha > 0.5, raster.depth / alpha.clamp_min(1e-10), BEYOND).float().cpu()
+def surface_depths(run: TrainingRun) -> dict[int, Float[Tensor, "_h _w"]]:
+    """By view, how far the initial points are at every pixel, on the CPU; BEYOND where they cover less than
+    half of one."""
+    blocks = range(run.scene.tree.num_blocks)
+    gaussians = Gaussians.cat([run.scene.stored(initial_of(block)) for block in blocks])
+    scales = gaussians.scales + math.log(SURFACE_SCALE)
+    opacities = torch.full_like(gaussians.opacities, math.log(SURFACE_OPACITY / (1 - SURFACE_OPACITY)))
+    points, found = replace(gaussians, opacities=opacities, scales=scales).to(run.device), {}
+    for index, view in run.views.items():
+        raster = run.rasterizer(points, view, sh_degree=0)
+        alpha = 1 - raster.transmittance
+        depth = torch.where(alpha > 0.5, raster.depth / alpha.clamp_min(1e-10), BEYOND)
+        found[index] = depth.float().cpu()
+    return found
+
+
+def pixel_kinds(depth: Float[Tensor, "h w"], view: View, cell: Box) -> UInt8[Tensor, "h w"]:
+    """What every pixel of `view`, whose surface lies at `depth`, is to a block with this cell: OWN, CLEAR or
+    0."""
+    depth = depth.to(view.viewmat)
+    span = ray_interval(cell, view, TileGrid(view.full, 1))
+    near, far = (plane.view_as(depth) for plane in (span.near, span.far))
+    own = (near <= depth) & (depth < far)
+    hidden = (depth < near) & near.isfinite()
+    return (OWN * own + CLEAR * (~own & ~hidden)).to(torch.uint8)
 
 
 class BlocksAlone(Visits):
@@ -107,7 +102,7 @@ class BlocksAlone(Visits):
 
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._scene = run, run.scene
-        self._surfaces: Surfaces | None = None
+        self._depths: dict[int, Float[Tensor, "_h _w"]] = {}
         self._regions: dict[int, UInt8[Tensor, "h w"]] = {}
         self._crops: dict[int, Crop] = {}
         self._part = 1.0
@@ -193,13 +188,12 @@ class BlocksAlone(Visits):
         if self._looked_at == block:
             return
         run, self._looked_at = self._run, block
-        if self._surfaces is None:
-            self._surfaces = Surfaces(self._scene, list(run.views.values()), run.rasterizer, run.device)
+        self._depths = self._depths or surface_depths(run)
         box, self._regions, self._crops = self._box(block), {}, {}
         begun = self._joined(block).gaussians.to(run.device)
         crops = footprints(begun, block, run.views.values(), run.rasterizer).crops
         for view, crop in crops.items():
-            region = self._surfaces.region(view, box)[crop.slices].to(run.device)
+            region = pixel_kinds(self._depths[view], run.views[view], box)[crop.slices].to(run.device)
             if bool(region.any()):
                 self._regions[view], self._crops[view] = region, crop
 

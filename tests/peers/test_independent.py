@@ -8,7 +8,15 @@ import torch
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_blocks, independent_trainer
+from abcd_ns.peers.independent import (
+    CLEAR,
+    OWN,
+    enlarged,
+    independent_blocks,
+    independent_trainer,
+    pixel_kinds,
+    surface_depths,
+)
 from tests.reference.scenes import GROWING, STILL, assert_resumes, equal, listen
 
 
@@ -91,14 +99,13 @@ def test_what_others_became_is_nothing_to_a_block(independent, photos):
 def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(independent, views):
     coordinator = independent()
     scene = coordinator.scene
-    surfaces = Surfaces(scene, views, coordinator.run.rasterizer, torch.device("cpu"))
+    depths = surface_depths(coordinator.run)
     for overlap in (0.0, 0.2):
         for view in views:
             owners = torch.zeros(view.height, view.width, dtype=torch.int64)
             for block in range(4):
                 box = enlarged(scene.tree.cell(block), scene.gaussians(block).means, overlap)
-                region = surfaces.region(view.index, box)
-                owners += region == OWN
+                owners += pixel_kinds(depths[view.index], view, box) == OWN
             assert int(owners.min()) == 1
             assert (int(owners.max()) == 1) == (overlap == 0)
 
