@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.errors import IMPORT_TROUBLE, missing
 from abcd_ns.nerfstudio.flags import check_config, trains_ours
+from abcd_ns.terminal import print_plain
 
 try:
     from abcd_ns.data.input_errors import exit_on_user_error
@@ -38,9 +39,7 @@ class UnavailableConfig(TrainerConfig):
 
     def print_to_terminal(self) -> None:
         """Say so and end; it is the first that `ns-train` calls."""
-        CONSOLE.print(
-            f"error: {self.trouble}", style="red", markup=False, emoji=False, soft_wrap=True, highlight=False
-        )
+        print_plain(f"error: {self.trouble}", CONSOLE, "red")
         raise SystemExit(2)
 
 

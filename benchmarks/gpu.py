@@ -27,7 +27,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import Options, make_plan, terrain_jobs
 from abcd_ns.lab.job import Job, Plan, TerrainSettings
-from abcd_ns.lab.results.records import decode, encode, read_json, write_json
+from abcd_ns.lab.results.records import decode, read_json, write_json
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.runner import run_jobs
@@ -127,7 +127,7 @@ def compare(args: Args, work: Path, by_steps: bool) -> Iterator[Found]:
     jobs = tuple(ScoredJob(method, args.seed, plan.settings, changes) for method, changes in arms)
     plan = replace(plan, kind="GPU comparison", jobs=jobs)
     for results in run_jobs(plan, Console()):
-        yield {"results": encode(results)}
+        yield {"results": asdict(results)}
 
 
 def extent(args: Args, work: Path) -> Iterator[Found]:
@@ -137,7 +137,7 @@ def extent(args: Args, work: Path) -> Iterator[Found]:
     jobs = terrain_jobs(settings, size.tiles, ("abcd", "abcd-monolithic"), (args.seed,))
     plan = Plan(TERRAIN, settings, work, jobs, "python -m benchmarks.gpu --parts extent")
     for results in run_jobs(plan, Console()):
-        yield {"results": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
+        yield {"results": asdict(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 
 def visits(args: Args, work: Path) -> Iterator[Found]:

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from abcd_ns.arguments import check_ranges
 from abcd_ns.cli.report.story import read_story
-from abcd_ns.cli.terminal import print_facts, print_plain
 from abcd_ns.cli.train import tool
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.runner import take_folder, taking
@@ -21,6 +20,7 @@ from abcd_ns.lab.world.table_scene import LAST, draw_table
 from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.run import STATE
+from abcd_ns.terminal import print_facts, print_plain
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.texts import clock
 

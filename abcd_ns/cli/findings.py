@@ -8,8 +8,8 @@ from typing import Literal
 
 from rich.console import Console
 
-from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
+from abcd_ns.terminal import print_plain
 
 Level = Literal["error", "warning", "note"]
 STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}

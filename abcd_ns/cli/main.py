@@ -26,11 +26,8 @@ class Command(NamedTuple):
     """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function. Takes seconds where it needs torch or nerfstudio.
-
-        Raises:
-            UserError: a package is missing.
-        """
+        """Import the function, or raise a UserError for a missing package. Takes seconds where it needs torch
+        or nerfstudio."""
         module, function = self.target.split(":")
         try:
             return getattr(importlib.import_module(module), function)
@@ -91,13 +88,9 @@ def run_command(command: Command, args: list[str]) -> int:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `abcd`.
+    """Entry point of `abcd`. `args` are the words after it; None takes them from the command line.
 
-    Args:
-        args: the words after `abcd`; None takes them from the command line.
-
-    Returns:
-        The exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
+    Returns the exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
     """
     first, *others = (sys.argv[1:] if args is None else args) or ["--help"]
     try:
@@ -120,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 128 + signal.SIGINT
     from rich.console import Console  # `abcd --help` has no use for it
 
-    from abcd_ns.cli.terminal import print_plain
+    from abcd_ns.terminal import print_plain
 
     print_plain(f"error: {message}", Console(stderr=True), "red")
     return 2

@@ -9,14 +9,8 @@ from abcd_ns.run import STATE
 
 
 def find_run(path: Path, holds: str) -> Path:
-    """The folder of a run that is named by it or by its config.yml.
-
-    Args:
-        holds: what is wanted of it, by its name in the run's folder STATE.
-
-    Raises:
-        UserError: there is none; the message says what to give.
-    """
+    """The folder of a run that is named by it or by its config.yml, and has `holds` in its folder STATE. A
+    UserError says what to give instead."""
     path, wanted = path.parent if path.name == "config.yml" else path, f"{STATE}/{holds}"
     if (path / wanted).exists():
         return path
@@ -32,11 +26,7 @@ def find_run(path: Path, holds: str) -> Path:
 
 
 def check_file(option: str, path: Path) -> None:
-    """Refuse, before any work, a file that could not be written.
-
-    Raises:
-        UserError: `path` is a folder, or lies in none.
-    """
+    """Refuse, before any work, a `path` that is a folder or lies in none; a UserError."""
     if path.is_dir():
         raise UserError(f"{option} {path} is a folder; name a file.")
     if not path.parent.is_dir():

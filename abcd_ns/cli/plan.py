@@ -17,7 +17,6 @@ from torch import Tensor
 
 from abcd_ns import methods
 from abcd_ns.arguments import Number, check_ranges
-from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
 from abcd_ns.engine.render import Shot, make_rasterizer
@@ -33,6 +32,7 @@ from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.run.fit import Demand, Fit, RamShares, blocks_to_begin_with, device_budget, find_fit
+from abcd_ns.terminal import many, print_facts
 from abcd_ns.units import bytes_in_words
 
 STATES = 3

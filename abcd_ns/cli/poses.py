@@ -21,11 +21,11 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from abcd_ns.cli.terminal import few, print_plain
 from abcd_ns.data.colmap_model import CAMERA_MODELS
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.picture_files import SUFFIXES, UNPOSED, UNREAD, check_complete, read_size, visible_files
 from abcd_ns.errors import UserError, first_line
+from abcd_ns.terminal import few, print_plain
 
 WORK = "poses.part"
 """The folder in which models are made; a command that is killed leaves it, the next one removes it."""
@@ -177,10 +177,7 @@ def _report(data: Path, names: tuple[str, ...], console: Console) -> int:
 
 def find_poses(task: Task, console: Console) -> Path | None:
     """Features, matches and poses, with a progress bar each; the model's folder, None where no photos match.
-
-    Raises:
-        UserError: pycolmap raised, or its process died; the message is its own.
-    """
+    A UserError, in pycolmap's own words, if that raised or its process died."""
     count = len(task.names)
     pairs = count * (count - 1) // 2 if task.order == "any" else count * OVERLAP
     context = multiprocessing.get_context("spawn")

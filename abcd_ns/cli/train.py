@@ -24,11 +24,7 @@ docs/reference.md lists all options."""
 
 
 def train(words: list[str]) -> int:
-    """Take the place of this process with `ns-train`.
-
-    Args:
-        words: the file, and options to hand on.
-    """
+    """Take the place of this process with `ns-train`, by the file and options in `words`."""
     if not words or words[0] in ("-h", "--help"):
         print(USAGE)
         return 0
@@ -37,11 +33,8 @@ def train(words: list[str]) -> int:
 
 
 def command_line(path: Path) -> list[str]:
-    """What a file's options are on the command line of `ns-train`.
-
-    Raises:
-        UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
-    """
+    """What a file's options are on the command line of `ns-train`. A UserError if it is absent, is no TOML,
+    names no method, or holds what no option can be."""
     data = read_toml(path, f"{path} does not exist.", trains=True)
     method = data.pop("method", None)
     if not isinstance(method, str):

@@ -7,6 +7,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from abcd_ns.errors import UserError
+from abcd_ns.terminal import print_plain
 
 SHOWN = 20  # lines of one error that are shown; the others are counted
 FEW = 3  # files with the same fault that are named; of more, others than the first are counted
@@ -21,8 +22,8 @@ def one_line(text: str) -> str:
 
 
 def say(text: str, style: str | None = None) -> None:
-    """Print text as it is: what stands in brackets is no markup, and long lines are left to the terminal."""
-    CONSOLE.print(text, style=style, highlight=False, markup=False, emoji=False, soft_wrap=True)
+    """Print text as it is, where nerfstudio prints."""
+    print_plain(text, CONSOLE, style)
 
 
 def print_error(text: str) -> None:

@@ -1,11 +1,13 @@
 """`python -m benchmarks.gpu` as far as it goes without a GPU: what is kept of a part, charts."""
 
+from dataclasses import asdict
+
 import pytest
 import torch
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.results.records import encode, read_json, write_json
+from abcd_ns.lab.results.records import read_json, write_json
 from abcd_ns.lab.results.results import Arm
 from benchmarks import gpu
 from benchmarks.gpu import Args, main, show
@@ -75,7 +77,7 @@ def test_every_record_is_shown(tmp_path, capsys):
         Arm(method, variant, None, (made_up_run(method, psnr=20.0 + k, **memory),))
         for k, (method, variant) in enumerate(arms)
     ]
-    found = {"results": encode(made_up("GPU comparison", *arms))}
+    found = {"results": asdict(made_up("GPU comparison", *arms))}
     show([WHOLE, WHOLE | {"part": "compare", "found": found}], tmp_path, Console())
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"compare-speed_accuracy.png", "compare-memory.png"}

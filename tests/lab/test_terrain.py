@@ -11,8 +11,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import Options, compare, make_plan, terrain_jobs
 from abcd_ns.lab.job import TerrainJob, TerrainSettings
-from abcd_ns.lab.results.results import TERRAIN, Arm
-from abcd_ns.lab.results.run import Failure, Footing, Run
+from abcd_ns.lab.results.results import TERRAIN, Arm, Failure, Footing, Run
 from abcd_ns.lab.results.tables import write_table
 from abcd_ns.lab.runs.runner import why_left_out
 from abcd_ns.lab.world.land import Land, color_of

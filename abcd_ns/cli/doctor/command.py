@@ -7,8 +7,8 @@ from rich.console import Console
 
 from abcd_ns.cli.doctor.facts import COMPILER, EXPORT, Facts, gather
 from abcd_ns.cli.findings import Finding, error, note, print_findings, warning
-from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.machine import without_home
+from abcd_ns.terminal import many, print_facts
 from abcd_ns.units import GIB, bytes_in_words
 
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")

@@ -12,7 +12,6 @@ import tyro
 
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.cli.paths import check_file, find_run
-from abcd_ns.cli.terminal import many
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
@@ -23,6 +22,7 @@ from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.formats.streamed import write_streamed
 from abcd_ns.progress_bar import tracked
 from abcd_ns.run import STATE, STORE
+from abcd_ns.terminal import many
 from abcd_ns.units import bytes_in_words
 
 TRANSFORMS = "dataparser_transforms.json"
@@ -169,12 +169,8 @@ def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffi
 
 
 def tell_rounding(suffix: str, largest: float, size: float) -> None:
-    """Print by how much positions are off, where that is more than LOST_DIGITS.
-
-    Args:
-        largest: of all coordinates.
-        size: of the scene.
-    """
+    """Print by how much positions are off, where that is more than LOST_DIGITS of the scene's `size`.
+    `largest` is that of all coordinates."""
     off = rounding(suffix, largest)
     if size > 0 and off > LOST_DIGITS * size:
         far = ": the data's origin is far away. --frame nerfstudio keeps all digits."

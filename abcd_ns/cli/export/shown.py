@@ -41,12 +41,8 @@ def check_trained(store: ParameterStore) -> None:
 
 @dataclass
 class Shown:
-    """The Gaussians of a store that are to be written.
-
-    Args:
-        to: the frame to write them in; None is their own.
-        box: which to keep, in that frame.
-    """
+    """The Gaussians of a store that are to be written: those in `box`, if there is one, in the frame `to`, or
+    in their own without any."""
 
     store: ParameterStore
     to: Frame | None

@@ -20,10 +20,7 @@ SAMPLES = 1000
 
 class DepthMaps:
     """What some views see, in files of `folder`: 7 bytes a pixel. As many are drawn at once as have room.
-
-    Args:
-        median: take the median depth, not the expected one.
-    """
+    Depths are median ones, or else expected ones."""
 
     def __init__(
         self,

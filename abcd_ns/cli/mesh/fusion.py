@@ -38,12 +38,8 @@ FAR = BOX / STRIDE
 
 
 class Fusion:
-    """Fuses depth maps. Begins by finding the boxes in which views see a surface, and parts them.
-
-    Args:
-        voxel: their side, world units.
-        part_boxes: of a part, about, those around it left out.
-    """
+    """Fuses depth maps on voxels with sides of `voxel` world units. Begins by finding the boxes in which
+    views see a surface, and parts them: about `part_boxes` a part, those around it left out."""
 
     def __init__(self, maps: DepthMaps, voxel: float, part_boxes: int = PART_BOXES) -> None:
         self._maps, self._voxel, self._seen = maps, voxel, list[np.ndarray]()

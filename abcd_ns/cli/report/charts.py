@@ -29,11 +29,8 @@ BINS = 160
 
 @in_style
 def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) -> str | None:
-    """PSNR over training time: of held-out views where they were drawn, and of training crops.
-
-    Args:
-        measured: the step of the checkpoint, and held-out PSNR (dB) as it was measured for the report.
-    """
+    """PSNR over training time: of held-out views where they were drawn, and of training crops. `measured` is
+    the step of the checkpoint, and held-out PSNR (dB) as it was measured for the report."""
     scored = {line.step: (line.seconds, line.psnr) for line in story.held_out}
     if measured is not None:
         scored[measured[0]] = (story.seconds_at(measured[0]), measured[1])
@@ -100,11 +97,8 @@ def _draw_visits(axes: Axes, story: Story) -> None:
 
 @in_style
 def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
-    """The blocks from above, and from the side where some lie above others.
-
-    Args:
-        cameras: those trained on, and those held out; none where the data is gone.
-    """
+    """The blocks from above, and from the side where some lie above others. `cameras` are those trained on,
+    and those held out; none where the data is gone."""
     tree, means = checkpoint.tree, checkpoint.means.double().numpy()
     centers = [found.camera_to_worlds[:, :3, 3].cpu().double().numpy() for found in cameras]
     planes = [(0, 1), (0, 2)] if bool((tree.axis == 2).any()) else [(0, 1)]

@@ -19,7 +19,6 @@ from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.cli.report import charts, figures
 from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
-from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import ERROR_GAIN
@@ -27,6 +26,7 @@ from abcd_ns.lab.results.tables import NOTHING, about_machine
 from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.run.log_lines import EndLine, TrainingLine
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
+from abcd_ns.terminal import print_plain
 from abcd_ns.units import bytes_in_words
 
 GENERATOR = "abcd report"
@@ -103,10 +103,8 @@ def render_page(
 ) -> str:
     """The whole page. Every text in it is escaped by the template; its script is the only one that may run.
 
-    Args:
-        held_out: None where the held-out views could not be drawn.
-        cameras: those trained on, and those held out; none where the data is gone.
-        notes: what the reader must know first.
+    `held_out` is None where those views could not be drawn. `cameras` are those trained on, and those held
+    out; none where the data is gone. `notes` are what the reader must know first.
     """
     settings, story, checkpoint = run.settings, run.story, run.checkpoint
     unfinished = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]

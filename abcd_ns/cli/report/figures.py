@@ -4,7 +4,6 @@ import shlex
 
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder, registered_config
-from abcd_ns.cli.terminal import many
 from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.tables import NOTHING
@@ -13,6 +12,7 @@ from abcd_ns.nerfstudio.datamanager import OUR_READER
 from abcd_ns.nerfstudio.options import MIRRORED, mirror
 from abcd_ns.nerfstudio.run import log_lines
 from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
+from abcd_ns.terminal import many
 from abcd_ns.units import GIB
 from abcd_ns.viewer.texts import clock
 

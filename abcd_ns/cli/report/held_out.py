@@ -10,7 +10,7 @@ from PIL import Image
 
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
-from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, to_bytes
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.progress_bar import tracked

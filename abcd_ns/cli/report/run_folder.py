@@ -72,12 +72,8 @@ def open_run(path: Path) -> RunFolder:
 
 
 def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
-    """The trained model of the checkpoint with its data, for drawing.
-
-    Raises:
-        UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
-            this version.
-    """
+    """The trained model of the checkpoint with its data, for drawing. A UserError where `pipeline_config`
+    raises one, the data is gone, or the checkpoint does not fit this version."""
     config, checkpoint = pipeline_config(run.path, data), run.checkpoint
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline = config.setup(device=device, test_mode="test").eval()
@@ -90,15 +86,9 @@ def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
 
 
 def pipeline_config(run: Path, data: Path) -> AbcdPipelineConfig:
-    """The options that a run was trained with, for the photos in `data`.
-
-    Args:
-        data: the folder of the photos, or its transforms.json. The path in the run is not followed: a run
-            from elsewhere could name anything.
-
-    Raises:
-        UserError: an option leads out of `data`, or is none of this version.
-    """
+    """The options that a run was trained with, for the photos in `data`: their folder, or its
+    transforms.json. The path in the run is not followed: a run from elsewhere could name anything. A
+    UserError if an option leads out of `data`, or is none of this version."""
     settings, prefix = read_record(run / STATE / SETTINGS_FILE, Settings, SCHEMA), "pipeline."
     where = _settings_file(run, settings)
     options = {n.removeprefix(prefix): v for n, v in settings.options.items() if n.startswith(prefix)}

@@ -71,13 +71,8 @@ class Story:
 
 
 def read_story(path: Path) -> Story:
-    """Read a log.
-
-    A last line without its end, as a kill leaves it, is passed over.
-
-    Raises:
-        RecordError: the file is absent, or a line is none of a log's; the message names it.
-    """
+    """Read a log. A last line without its end, as a kill leaves it, is passed over. A RecordError says that
+    the file is absent, or names a line that is none of a log's."""
     if not path.exists():
         raise RecordError(f"{path} does not exist; runs of this version of abcd_ns write it.")
     texts = path.read_bytes().split(b"\n")[:-1]

@@ -9,8 +9,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from abcd_ns.lab.results.results import Arm, Results
-from abcd_ns.lab.results.run import CurvePoint, Run
+from abcd_ns.lab.results.results import Arm, CurvePoint, Results, Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, lay_grid, save
 from abcd_ns.units import MIB
 

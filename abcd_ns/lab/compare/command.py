@@ -30,12 +30,12 @@ from abcd_ns.lab.job import (
     scene_name,
 )
 from abcd_ns.lab.results.records import decode, read_toml
-from abcd_ns.lab.results.results import TERRAIN, Results
-from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.results import TERRAIN, Results, Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.configs import REGISTERED, check_options, check_scene
 from abcd_ns.lab.runs.options import parse_changes
-from abcd_ns.lab.runs.runner import run_jobs, say, write_report
+from abcd_ns.lab.runs.runner import run_jobs, write_report
+from abcd_ns.terminal import print_plain
 from abcd_ns.units import bytes_in_words
 
 PICTURES = "pictures"
@@ -161,11 +161,8 @@ def read_options(path: Path) -> Options:
 
 
 def make_plan(options: Options) -> Plan:
-    """Fill in defaults and check everything that can be checked without reading the scene.
-
-    Raises:
-        UserError: an option is missing, out of range or contradicts another.
-    """
+    """Fill in defaults and check all that can be checked without reading the scene; a UserError if an option
+    is missing, out of range or contradicts another."""
     if len(options.blocks or ()) > 1 or options.vary:
         options = options.over(Options(methods=("abcd",)))
     given = options.over(DEFAULTS if options.tiles is None else TERRAIN_DEFAULTS)
@@ -264,7 +261,7 @@ def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     if results.arms:
         print_rows(rows(results), [*results.findings, *notes(results)], console)
     for path in paths:
-        say(console, path)
+        print_plain(str(path), console)
     return 1 if results.failures else 0
 
 

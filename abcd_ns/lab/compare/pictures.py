@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from abcd_ns.engine.render.loss import decibels
-from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.results import Run
 from abcd_ns.lab.results.style import in_style
 
 ERROR_GAIN = 4
@@ -29,11 +29,8 @@ def error_map(picture: PictureArray, photo: PictureArray) -> NDArray[np.float32]
 
 @in_style
 def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], title: str, path: Path) -> None:
-    """Write one figure: photo and pictures above, errors below, on one scale with its legend.
-
-    Args:
-        pictures: by the name to print above each, of the photo's size.
-    """
+    """Write one figure: photo and pictures, by the name to print above each, and errors below, on one scale
+    with its legend."""
     height, width = photo.shape[:2]
     columns = 1 + len(pictures)
     size = (COLUMN_INCHES * columns, 2 * (COLUMN_INCHES * height / width + 0.25) + 0.25)
@@ -63,11 +60,8 @@ def _show(axes: Axes, picture: NDArray, title: str, **look: object) -> AxesImage
 
 
 def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
-    """One figure for each held-out view that the runs left pictures of; returns their paths.
-
-    Args:
-        runs: one run per method, each with the folder that it left its pictures in.
-    """
+    """One figure for each held-out view that the runs, one a method, left pictures of in their folders;
+    returns the paths."""
     if not runs:
         return []
     first, folder = runs[0]

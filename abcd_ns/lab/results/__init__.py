@@ -1,4 +1,4 @@
 """What experiments find: one schema of records, and how they are read.
 
-`run` and `results` are the schema, `records` reads and writes it, `tables` and `style` show it.
+`results` is the schema, `records` reads and writes it, `tables` and `style` show it.
 """

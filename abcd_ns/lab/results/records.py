@@ -29,14 +29,8 @@ class RecordError(UserError):
 
 
 def decode(cls: type[R], data: Any, where: str) -> R:
-    """`data`, as JSON or TOML gives it, as the dataclass `cls`.
-
-    Args:
-        where: the file that `data` comes from; begins every message.
-
-    Raises:
-        RecordError: a field is missing or of another type, or there is none of that name.
-    """
+    """`data`, as JSON or TOML gives it, as the dataclass `cls`. A RecordError, which begins with `where`, the
+    file of the data, if a field is missing or of another type, or there is none of that name."""
     if isinstance(data, dict):
         names = [field.name for field in dataclasses.fields(cls)]
         for name in data.keys() - set(names):
@@ -49,17 +43,9 @@ def decode(cls: type[R], data: Any, where: str) -> R:
         raise RecordError(f"{where}: {str(error).replace('`', '').replace('$.', '')}.") from None
 
 
-def encode(record: Any) -> dict[str, Any]:
-    """The record as plain values; `write_json` refuses those that JSON lacks."""
-    return dataclasses.asdict(record)
-
-
 def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Write indented JSON, so that a reader sees the old file or the new one, never a part.
-
-    Raises:
-        ValueError: a number is NaN or infinite.
-    """
+    """Write indented JSON, so that a reader sees the old file or the new one, never a part. A ValueError if a
+    number is NaN or infinite."""
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     temporary.replace(path)
@@ -76,16 +62,9 @@ def read_json(path: Path) -> Any:
 
 
 def read_toml(path: Path, absent: str, *, trains: bool = False) -> dict[str, Any]:
-    """A user's options in TOML.
-
-    Args:
-        path: of the file. Where there is none, `small-gpu` and `configs/small-gpu.toml` are one of ours.
-        absent: what to say where there is no such file either.
-        trains: it is for `abcd train`, not for a comparison.
-
-    Raises:
-        RecordError: the file is absent, or is no TOML.
-    """
+    """A user's options in TOML: for `abcd train` if it `trains`, else for a comparison. Where there is no
+    such file, `small-gpu` and `configs/small-gpu.toml` are one of ours. A RecordError says `absent` where
+    these have none either, or that the file is no TOML."""
     if not path.is_file() and path.parent in (Path(), Path("configs")):
         path = next((own for own in own_configs(trains) if own.stem == path.name.removesuffix(".toml")), path)
     try:

@@ -14,9 +14,9 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from abcd_ns.lab.job import AS_IT_IS, HELD_OUT_EVERY
-from abcd_ns.lab.results.results import TERRAIN, Arm, Outcome, Results
-from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.results import TERRAIN, Arm, Outcome, Results, Run
 from abcd_ns.machine import Machine
+from abcd_ns.terminal import print_plain
 from abcd_ns.units import GIB, MIB
 
 TABLE_FILE = "table.md"
@@ -267,4 +267,4 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
     console.print(shown)
     console.width = width
     for remark in remarks:
-        console.print(f"- {remark}", highlight=False, markup=False, emoji=False, soft_wrap=True)
+        print_plain(f"- {remark}", console)

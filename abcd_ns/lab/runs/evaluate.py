@@ -13,7 +13,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.loss import decibels, psnr
 from abcd_ns.engine.types import Layer
-from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.nerfstudio.metrics import counted, image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
 
@@ -58,11 +58,8 @@ class Drawn:
 def draw_held_out(
     pipeline: VanillaPipeline, rows: Collection[int] | None = None, composited: bool = True
 ) -> Iterator[Drawn]:
-    """Every held-out view, or those at `rows`, in order; photos are read one at a time where possible.
-
-    Args:
-        composited: draw the blocks one by one, too.
-    """
+    """Every held-out view, or those at `rows`, in order; photos are read one at a time where possible. The
+    blocks are drawn one by one, too, if `composited`."""
     model, names = pipeline.model, pipeline.datamanager.eval_dataset.image_filenames
     background = model.background_color.to(model.device)
     with undisturbed(pipeline):
@@ -80,11 +77,7 @@ def draw_held_out(
 
 
 def ordering_gap(squared_gaps: Sequence[float], blocks: int) -> tuple[float | None, str | None]:
-    """The ordering gap, dB, or None and why there is none.
-
-    Args:
-        squared_gaps: by held-out view, from `squared_gap`.
-    """
+    """The ordering gap, dB, by the `squared_gap` of each held-out view; or None and why there is none."""
     if blocks == 1:
         return None, "one block: merged and composited are the same picture"
     if any(squared_gaps):

@@ -69,11 +69,8 @@ def change_options(pipeline: Any, changes: Sequence[str]) -> None:
 
 
 def set_options(config: Any, values: Mapping[str, bool | int | float | str | None], where: str) -> None:
-    """Set options to what a file says of them, in place. What is not one word keeps its default.
-
-    Args:
-        where: the file; begins the message of a UserError about what does not fit.
-    """
+    """Set options to what the file `where` says of them, in place. What is not one word keeps its default. A
+    UserError, which begins with `where`, about what does not fit."""
     known, more = option_names(config), flat_options(config)
     for path, value in values.items():
         if path not in known and path not in more:

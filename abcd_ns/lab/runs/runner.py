@@ -21,11 +21,11 @@ from rich.markup import escape
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Job, Plan, Settings, TerrainJob
-from abcd_ns.lab.results.records import RecordError, decode, encode, read_json, write_json
-from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results
-from abcd_ns.lab.results.run import Failure, Run
+from abcd_ns.lab.results.records import RecordError, decode, read_json, write_json
+from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, Failure, LeftOut, Results, Run
 from abcd_ns.lab.results.tables import TABLE_FILE, findings_of, write_table
 from abcd_ns.machine import Machine, describe_machine, describe_versions, peak_device_bytes, peak_rss_bytes
+from abcd_ns.terminal import print_plain
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
 SCENE = "photos and points"
@@ -37,16 +37,10 @@ MOST_IN_ONE_BLOCK = 4_000_000
 
 
 def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[Results]:
-    """Do the plan's jobs, one by one; after each, all that was found so far.
-
-    Args:
-        overwrite: drop the runs that its folder holds.
-
-    Raises:
-        UserError: the folder holds something else, or runs that cannot be compared with these.
-    """
+    """Do the plan's jobs, one by one; after each, all that was found so far. `overwrite` drops the runs that
+    its folder holds. A UserError if that holds something else, or runs that cannot be compared with these."""
     machine, found, left_out = describe_machine(), [], {}
-    shared = {**encode(plan.settings), SCENE: plan.scene, **encode(machine)}
+    shared = {**dataclasses.asdict(plan.settings), SCENE: plan.scene, **dataclasses.asdict(machine)}
     claim(plan.out, plan.kind, shared, overwrite)
     for number, job in enumerate(plan.jobs, start=1):
         if job.method in left_out:
@@ -59,16 +53,13 @@ def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[
             found.append((job, outcome))
         else:
             left_out[job.method] = reason
-            say(console, f"{job.method} is left out: {reason}.")
+            print_plain(f"{job.method} is left out: {reason}.", console)
         yield gather(plan, found, machine, left_out)
 
 
 def why_left_out(job: Job, outcome: Run | Failure | None = None) -> str | None:
-    """Why the job's method cannot run on this machine or under this protocol, if it cannot.
-
-    Args:
-        outcome: what came of the job, if it was tried.
-    """
+    """Why the job's method cannot run on this machine or under this protocol, if it cannot; by `outcome`, if
+    it was tried."""
     if isinstance(job, TerrainJob) and job.method == "abcd-monolithic":
         if job.value * job.settings.gaussians > MOST_IN_ONE_BLOCK:
             return f"{job.value} tiles have more than {MOST_IN_ONE_BLOCK:,} Gaussians"
@@ -107,27 +98,15 @@ def new_results(kind: str, command: str, machine: Machine, **fields: Any) -> Res
 
 def write_report(results: Results, out: Path) -> list[Path]:
     """Write results.json and the table; returns their paths."""
-    write_json(out / RESULTS_FILE, encode(results))
+    write_json(out / RESULTS_FILE, dataclasses.asdict(results))
     write_table(results, out / TABLE_FILE)
     return [out / RESULTS_FILE, out / TABLE_FILE]
 
 
-def say(console: Console, text: object) -> None:
-    """Print a line as it is, whatever names stand in it."""
-    console.print(str(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
-
-
 def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = False) -> None:
-    """Make `out` the folder of an experiment's results.
-
-    Args:
-        kind: of the experiment, in words.
-        shared: what all its runs have in common, by name: values of JSON's.
-        overwrite: drop the runs that are there.
-
-    Raises:
-        UserError: `out` holds something else, or runs that do not share that, or cannot be written.
-    """
+    """Make `out` the folder of an experiment's results, whose runs have `shared` in common, by name: values
+    of JSON's. `overwrite` drops the runs that are there. A UserError if `out` holds something else, or runs
+    that do not share that, or cannot be written."""
     marker = out / f"{kind.replace(' ', '-')}.json"
     with taking(out):
         if take_folder(out, marker, kind) and overwrite:
@@ -183,7 +162,7 @@ def finish_job(job: Job, out: Path, console: Console, head: str) -> Run | Failur
     if outcome is None:
         with console.status(f"{escape(head)}; log: {escape(str(job.folder(out) / LOG_FILE))}"):
             outcome, how = run_job(job, out), ""
-    say(console, f"{head}: {how}{_short(outcome)}")
+    print_plain(f"{head}: {how}{_short(outcome)}", console)
     return outcome
 
 
@@ -197,7 +176,7 @@ def run_job(job: Job, out: Path) -> Run | Failure:
     folder = job.folder(out)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    write_json(folder / JOB_FILE, encode(job))
+    write_json(folder / JOB_FILE, dataclasses.asdict(job))
     log = folder / LOG_FILE
     command = [*command_of(job), str(folder / JOB_FILE)]
     env = {**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"}
@@ -237,11 +216,8 @@ def _short(outcome: Run | Failure) -> str:
 
 
 def work(kind: type[Job], do: Callable[..., Run]) -> int:
-    """In a job's process, whose only argument is the job's file: do it; 0, or 2 for an error of the user's.
-
-    Args:
-        do: given the job and its folder.
-    """
+    """In a job's process, whose only argument is the job's file: `do` it, given job and folder; returns 0, or
+    2 for an error of the user's."""
     (path,) = map(Path, sys.argv[1:])
     job = decode(kind, read_json(path), str(path))
     try:
@@ -249,7 +225,7 @@ def work(kind: type[Job], do: Callable[..., Run]) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    write_json(path.with_name(RUN_FILE), encode(found))
+    write_json(path.with_name(RUN_FILE), dataclasses.asdict(found))
     return 0
 
 

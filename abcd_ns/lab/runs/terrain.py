@@ -25,7 +25,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.job import TerrainJob
-from abcd_ns.lab.results.run import Footing, Run
+from abcd_ns.lab.results.results import Footing, Run
 from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes

@@ -25,7 +25,7 @@ from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
 from abcd_ns.formats.scene_file import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
-from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
+from abcd_ns.lab.results.results import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap, to_bytes
 from abcd_ns.lab.runs.runner import memory_of_run, work
@@ -38,14 +38,9 @@ from abcd_ns.units import bytes_in_words
 
 
 def run(job: Job, folder: Path) -> Run:
-    """Train and score.
-
-    Args:
-        folder: `job.folder(out)`; gets nerfstudio's files, and pictures of some held-out views.
-
-    Raises:
-        UserError, SystemExit: the scene or an option cannot be used; said on the console.
-    """
+    """Train and score. `folder`, which is `job.folder(out)`, gets nerfstudio's files, and pictures of some
+    held-out views. A UserError or SystemExit if the scene or an option cannot be used; said on the
+    console."""
     training = set_up(job, folder.parent.parent.parent)
     training.trainer.train()
     budget = getattr(training.trainer.config.pipeline, "gaussian_bytes", 0)
@@ -85,11 +80,7 @@ def run(job: Job, folder: Path) -> Run:
 
 
 def set_up(job: Job, out: Path) -> "Training":
-    """All that comes before the first step.
-
-    Args:
-        out: where the job's folder is.
-    """
+    """All that comes before the first step; `out` is where the job's folder is."""
     config = trainer_config(job, out)
     if isinstance(config, AbcdTrainerConfig):
         config.check()
@@ -102,10 +93,8 @@ def set_up(job: Job, out: Path) -> "Training":
 
 
 class Training:
-    """A trainer that is set up, whose held-out views are scored at the settings' moments of the run.
-
-    The run's stopwatch is paused meanwhile. The end is left to the caller.
-    """
+    """A trainer that is set up, whose held-out views are scored at the settings' moments of the run, while
+    its stopwatch is paused. The end is left to the caller."""
 
     def __init__(self, trainer: Trainer, settings: Settings) -> None:
         self.trainer, self.pipeline = trainer, trainer.pipeline
@@ -136,11 +125,7 @@ class Training:
             self._look()
 
     def _note_held(self, drawing: bool) -> None:
-        """Count what is held now.
-
-        Args:
-            drawing: layers are about to be drawn, and steps have not begun.
-        """
+        """Count what is held now; if `drawing`, layers are about to be drawn, and steps have not begun."""
         coordinator = self.coordinator
         config, gaussians = coordinator.config, len(coordinator.params["means"])
         degree = active_gaussians(coordinator.params).sh_degree

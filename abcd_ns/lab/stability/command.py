@@ -15,11 +15,12 @@ from abcd_ns.arguments import Flag, Number, check_ranges, words
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.results import Outcome
 from abcd_ns.lab.results.tables import findings_of, headline
-from abcd_ns.lab.runs.runner import claim, new_results, say, write_report
+from abcd_ns.lab.runs.runner import claim, new_results, write_report
 from abcd_ns.lab.stability import scenarios
 from abcd_ns.lab.stability.lab import Lab, Scenario
 from abcd_ns.machine import describe_machine
 from abcd_ns.progress_bar import ProgressBar
+from abcd_ns.terminal import print_plain
 
 KIND = "stability report"
 SCENARIOS = {one.id: one for one in vars(scenarios).values() if isinstance(one, Scenario)}
@@ -65,7 +66,7 @@ def stability(
             results = replace(blank, outcomes=tuple(outcomes))
             paths = write_report(replace(results, findings=findings_of(results)), out)
     for text in (*paths, headline(outcomes)):
-        say(console, text)
+        print_plain(str(text), console)
     return 0 if all(outcome.passed for outcome in outcomes) else 1
 
 
@@ -83,9 +84,9 @@ def examine(lab: Lab, scenario: Scenario, console: Console) -> Outcome:
     found = scenario.run(lab)
     seconds = round(time.perf_counter() - began, 1)
     word = "pass" if found.passed else "FAIL"
-    say(console, f"{scenario.id:>4}  {word}  {scenario.fails}  ({seconds:.0f} s)")
+    print_plain(f"{scenario.id:>4}  {word}  {scenario.fails}  ({seconds:.0f} s)", console)
     for method, said in found.said.items():
-        say(console, f"            {method}: {said}")
+        print_plain(f"            {method}: {said}", console)
     asked = (scenario.id, scenario.fails, scenario.done, scenario.rule)
     numbers = {name: float(value) for name, value in found.numbers.items()}
     return Outcome(*asked, found.passed, found.worse, found.said, numbers, seconds)

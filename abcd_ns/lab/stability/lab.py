@@ -100,11 +100,8 @@ class Trained(NamedTuple):
 
 
 class Lab:
-    """Where scenarios are carried out: a folder for stores, and a rasterizer.
-
-    Args:
-        seed: of every training that names none.
-    """
+    """Where scenarios are carried out: a folder for stores, a rasterizer, and the seed of every training that
+    names none."""
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
         self.seed, self._folder, self.rasterizer = seed, folder, TorchRasterizer()
@@ -120,12 +117,8 @@ class Lab:
         partition: Literal["kd", "grid"] = "kd",
         **training: Any,
     ) -> Coordinator:
-        """A run that begins, in a new store.
-
-        Args:
-            budget: steps of the whole run. Nearly all draw one view, as blocks are under-trained here.
-            training: options of TrainingConfig.
-        """
+        """A run of `budget` steps that begins, in a new store, with `training` as options of TrainingConfig.
+        Nearly all steps draw one view, as blocks are under-trained here."""
         usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": SH_DEGREE}
         config = TrainingConfig(**{**usual, "seed": self.seed, **training})
         blocks = 1 if method == "abcd-monolithic" else blocks
@@ -137,10 +130,7 @@ class Lab:
 
     def train(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train on a stage under the conditions of comparisons: as few steps and Gaussians for every method.
-
-        Args:
-            options: of `coordinator`; they go before these.
-        """
+        `options` of `coordinator` go before these."""
         coordinator = self.coordinator(stage, method, **{"density": LIMITED, **options})
         while not coordinator.finished:
             train_step(coordinator, stage)
@@ -191,8 +181,3 @@ class Scenario:
     rule: str
     """What passes."""
     run: Callable[[Lab], Finding]
-
-
-def scenario(id: str, fails: str, done: str, rule: str) -> Callable[[Callable[[Lab], Finding]], Scenario]:
-    """Makes a scenario of the function that carries it out."""
-    return lambda run: Scenario(id, fails, done, rule, run)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from statistics import mean
 
@@ -20,7 +21,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Finding, Lab, Stage, make_stage, scenario
+from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Finding, Lab, Scenario, Stage, make_stage
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, Wall, World, camera, ring
 
 FEW = 3
@@ -75,7 +76,8 @@ def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
     return Finding(passed, said, numbers, worse)
 
 
-@scenario(
+@partial(
+    Scenario,
     "A11",
     "sparse, unbalanced views; a random start costs 4 to 5 dB (RAIN-GS)",
     f"{FEW} of 16 cameras; points at random places",
@@ -89,7 +91,8 @@ def sparse(lab: Lab) -> Finding:
     return lost(lab, {f"{FEW} views": stage.only(FEW), "a random start": random})
 
 
-@scenario(
+@partial(
+    Scenario,
     "A12",
     "noisy poses, changing exposure (H3DGS #55, VastGaussian)",
     f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo {GAIN} times as bright",
@@ -106,7 +109,8 @@ RISES_BY = 1e-3
 """A visit raised the objective if by more than this share of it."""
 
 
-@scenario(
+@partial(
+    Scenario,
     "A13",
     "old layers oscillate and diverge",
     "layers drawn anew for each visit, without a warm-up; the full objective after each",
@@ -167,7 +171,8 @@ def above(count: int, turn: float = 0.0) -> list[View]:
     return views
 
 
-@scenario(
+@partial(
+    Scenario,
     "A14",
     'seams, "chunk bleeding" and "ghosting" at borders (LoD of Gaussians, VastGaussian #49)',
     "a textured floor over four blocks, seen by held-out cameras",
@@ -193,7 +198,8 @@ def seams(lab: Lab) -> Finding:
     return Finding(numbers["ratio abcd"] <= SEAM, said, numbers, worse=against > 1)
 
 
-@scenario(
+@partial(
+    Scenario,
     "A16",
     "sky and far background lost (H3DGS #39, Inria #300)",
     f"a textured shell {FAR:g} times as far away as the cameras stand",
@@ -209,7 +215,8 @@ CLIFF_DB = 0.5
 COUNTS = (1, 2, 4, 8, 27)
 
 
-@scenario(
+@partial(
+    Scenario,
     "A19",
     "the number of blocks decides the quality",
     f"{', '.join(map(str, COUNTS))} blocks and a grid of 4, on a budget of 600 views",
@@ -233,7 +240,8 @@ FOG = 0.02
 """Of the screen, in the mean over training views, at most."""
 
 
-@scenario(
+@partial(
+    Scenario,
     "A23",
     "fog before the cameras imitates each photo's vignette (drone captures)",
     "photos that darken by half towards their corners",

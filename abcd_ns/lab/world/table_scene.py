@@ -18,12 +18,8 @@ LAST = MODEL / "points3D.bin"
 
 
 def draw_table(out: Path, count: int, size: tuple[int, int], points: int) -> None:
-    """Draw `count` pictures from around the table into `out`/images, and write the model.
-
-    Args:
-        size: width and height of the pictures, px.
-        points: of the model, about; on what the cameras see, without observations.
-    """
+    """Draw `count` pictures of `size` (width, height) from around the table into `out`/images, and write the
+    model, with about as many `points` on what the cameras see, without observations."""
     views = ring(count, size=size)
     (out / "images").mkdir(parents=True, exist_ok=True)
     images = {}

@@ -77,11 +77,7 @@ class World(ABC):
 
     @abstractmethod
     def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:
-        """Along rays.
-
-        Args:
-            pixel_angle: radians that a ray stands for; textures may be no finer.
-        """
+        """Along rays, each of which stands for `pixel_angle` radians: textures may be no finer."""
 
     def first(self, view: View, crop: Crop | None = None) -> Seen:
         """Along each pixel's ray, row by row."""
@@ -169,11 +165,8 @@ def camera(
 
 
 def ring(count: int, *, turn: float = 0.0, size: tuple[int, int] = (48, 36)) -> list[View]:
-    """Cameras on the unit circle, at three heights in turn, all looking at the middle.
-
-    Args:
-        turn: by how much of the step from camera to camera all are turned.
-    """
+    """Cameras on the unit circle, at three heights in turn, all looking at the middle. `turn` moves all by
+    that share of the step from camera to camera."""
     views = []
     for index in range(count):
         angle = 2 * math.pi * (index + turn) / count

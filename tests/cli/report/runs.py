@@ -12,7 +12,7 @@ from abcd_ns.cli.report.held_out import HeldOut, Shown
 from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.lab.runs.configs import REGISTERED
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import log_lines

@@ -2,9 +2,9 @@
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
-from abcd_ns.lab.results.records import encode
 from tests.lab.compare.records import made_up_run
 
 WORKER = """
@@ -39,7 +39,7 @@ class FakeWorker:
         self.folder = folder
         folder.mkdir()
         (folder / "worker.py").write_text(WORKER)
-        (folder / "run.json").write_text(json.dumps(encode(made_up_run())))
+        (folder / "run.json").write_text(json.dumps(asdict(made_up_run())))
         self.behave()
 
     def behave(self, changed: dict[str, str | dict] | None = None, **by_method: str) -> None:

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from abcd_ns.lab.job import Settings
 from abcd_ns.lab.results.records import read_record
-from abcd_ns.lab.results.results import SCHEMA, Arm, LeftOut, Results
-from abcd_ns.lab.results.run import CurvePoint, Failure, Run, ViewScore
+from abcd_ns.lab.results.results import SCHEMA, Arm, CurvePoint, Failure, LeftOut, Results, Run, ViewScore
 from abcd_ns.lab.results.tables import findings_of
 from abcd_ns.machine import Machine, Versions
 

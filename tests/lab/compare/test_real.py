@@ -10,7 +10,7 @@ from rich.console import Console
 
 from abcd_ns.cli.export.command import export
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
-from abcd_ns.lab.results.run import CurvePoint
+from abcd_ns.lab.results.results import CurvePoint
 from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
 from tests.reference.colmap_scene import HELD_OUT, write_scene

@@ -2,13 +2,13 @@
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from abcd_ns.lab.results.records import RecordError, encode, write_json
-from abcd_ns.lab.results.results import SCHEMA
-from abcd_ns.lab.results.run import CurvePoint
+from abcd_ns.lab.results.records import RecordError, write_json
+from abcd_ns.lab.results.results import SCHEMA, CurvePoint
 from abcd_ns.lab.runs.evaluate import ordering_gap
 from tests.lab.compare.records import made_up_results, made_up_run, read_results
 
@@ -17,7 +17,7 @@ def test_results_come_back_as_they_were_written(tmp_path):
     points = (CurvePoint(0.1, 10**9, -3.5, 7), CurvePoint(1e9, 2, 1e-30))
     run = made_up_run(ordering_gap_db=None, gaussians=2**40, curve=points, lpips_reason="\ud7ff \u2713 'a'")
     results = made_up_results(run, made_up_run("abcd-monolithic"))
-    write_json(tmp_path / "results.json", encode(results))
+    write_json(tmp_path / "results.json", asdict(results))
     assert read_results(tmp_path / "results.json") == results
 
 
@@ -25,9 +25,9 @@ def test_results_come_back_as_they_were_written(tmp_path):
 def test_no_number_that_json_lacks_is_written_or_read(tmp_path, number):
     path = tmp_path / "results.json"
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(path, encode(made_up_results(made_up_run(ssim=number))))
+        write_json(path, asdict(made_up_results(made_up_run(ssim=number))))
     assert not path.exists()
-    path.write_text(json.dumps(encode(made_up_results(made_up_run(ssim=number)))))
+    path.write_text(json.dumps(asdict(made_up_results(made_up_run(ssim=number)))))
     with pytest.raises(RecordError, match="is not JSON"):
         read_results(path)
 
@@ -47,7 +47,7 @@ def test_no_number_that_json_lacks_is_written_or_read(tmp_path, number):
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_by_field(tmp_path, was, becomes, message):
-    path, text = tmp_path / "results.json", json.dumps(encode(made_up_results(made_up_run(psnr=23.6))))
+    path, text = tmp_path / "results.json", json.dumps(asdict(made_up_results(made_up_run(psnr=23.6))))
     assert was in text
     path.write_text(text.replace(was, becomes, 1) if was else becomes)
     with pytest.raises(RecordError, match=message) as caught:

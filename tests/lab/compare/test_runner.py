@@ -14,8 +14,7 @@ from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.job import Plan
-from abcd_ns.lab.results.records import encode
-from abcd_ns.lab.results.run import Failure, Run
+from abcd_ns.lab.results.results import Failure, Run
 from abcd_ns.lab.runs.runner import run_jobs
 from tests.lab.compare.records import MACHINE, read_results
 
@@ -55,7 +54,7 @@ def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
     run(dataclasses.replace(plan, jobs=plan.jobs[:1]))
     half = plan.jobs[1].folder(plan.out)  # what a killed worker leaves
     half.mkdir(parents=True)
-    (half / "job.json").write_text(json.dumps(encode(plan.jobs[1])))
+    (half / "job.json").write_text(json.dumps(dataclasses.asdict(plan.jobs[1])))
     (half / "leftover").write_text("")
     worker.calls()
     assert [outcome.method for outcome in run(plan)] == ["abcd-monolithic", "abcd"]
