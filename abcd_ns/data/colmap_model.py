@@ -54,11 +54,9 @@ def find_models(data: Path) -> list[Path]:
 def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
     """The scene of a COLMAP model, in a z-up world: `applied_transform` is the change of axes from COLMAP's.
 
-    Args:
-        data: the data root.
-        model: the folder with cameras and images, as .bin or else .txt, and points3D as either or .ply.
-        images: the folder of photos, from `data`. Where there is no IMAGES, photos may lie in `data` itself.
-        masks: the folder of masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg.
+    `model` is the folder with cameras and images, as .bin or else .txt, and points3D as either or .ply.
+    `images` and `masks` are folders from the root `data`. Where there is no IMAGES, photos may lie in `data`
+    itself. The mask of a.jpg is a.png, a.jpg.png or a.jpg.
     """
     problems, found = Problems(), []
     cameras, listed = (_part(model, name) or model / f"{name}.bin" for name in ("cameras", "images"))
@@ -265,13 +263,13 @@ def _broken_line(path: Path, number: int) -> InputError:
 def _cameras_txt(path: Path) -> dict[int, Lens]:
     sizes, lenses = dict(CAMERA_MODELS.values()), {}
     for number, line in _lines(path):
-        words = line.split()
-        if not words:
+        if not line:
             continue
         try:
-            camera, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-            params = tuple(map(float, words[4:]))
-        except (ValueError, IndexError):
+            camera, model, width, height, *params = line.split()
+            camera, width, height = int(camera), int(width), int(height)
+            params = tuple(map(float, params))
+        except ValueError:
             raise _broken_line(path, number) from None
         if model not in sizes:
             raise _unsupported(path, camera, model)
@@ -307,16 +305,14 @@ def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
 def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
     xyz, rgb = [], []
     for number, line in _lines(path):
-        words = line.split(maxsplit=7)
-        if not words:
+        if not line:
             continue
         try:
-            xyz.append(tuple(map(float, words[1:4])))
-            rgb.append(tuple(min(max(int(word), 0), 255) for word in words[4:7]))
+            _, x, y, z, red, green, blue, *_ = line.split(maxsplit=7)
+            xyz.append((float(x), float(y), float(z)))
+            rgb.append([min(max(int(color), 0), 255) for color in (red, green, blue)])
         except ValueError:
             raise _broken_line(path, number) from None
-        if len(words) < 7:
-            raise _broken_line(path, number)
     return np.array(xyz, dtype=np.float64).reshape(-1, 3), np.array(rgb, dtype=np.uint8).reshape(-1, 3)
 
 

@@ -158,14 +158,11 @@ def check_layout(scene: Scene) -> None:
 def split_lists(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
 ) -> SplitLists | None:
-    """The lists that there are as one split, or why they are none; None without any.
+    """The lists that there are as one split, or why they are none; None without any. What is held out is val
+    and test together. If only one side is listed, the other is all the rest.
 
-    What is held out is val and test together. If only one side is listed, the other is all the rest.
-
-    Args:
-        found: what each list names.
-        known: the name of each frame, by what lists call it.
-        label: what messages call the list of a split.
+    `found` is what each list names, `known` the name of each frame by what lists call it; `label` gives what
+    messages call the list of a split.
     """
     try:
         return _one_split(found, known, label) if found else None

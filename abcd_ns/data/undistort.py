@@ -40,9 +40,9 @@ class Undistortion:
 def undistortion(lens: Lens) -> Undistortion:
     """The pinhole camera for a lens with distortion: the largest view without unseen pixels.
 
-    As nerfstudio does: OpenCV's getOptimalNewCameraMatrix with alpha = 0, cropped to its valid
-    rectangle, or the fisheye module's counterpart with balance = 0. Coefficients that fold the image over
-    itself, or leave no usable view, are refused.
+    As nerfstudio does: OpenCV's getOptimalNewCameraMatrix with alpha = 0, cropped to its valid rectangle, or
+    the fisheye module's counterpart with balance = 0. Refuses coefficients that fold the image over itself,
+    or leave no usable view.
     """
     K, coefficients = lens.matrix - _HALF_PIXEL, np.array(lens.distortion)
     if lens.fisheye:

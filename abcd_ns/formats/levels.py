@@ -11,10 +11,8 @@ from torch import Tensor
 
 from abcd_ns.engine.types import Gaussians
 
-NEIGHBOURS = 8
-"""With which a Gaussian may be merged."""
-COLOR = 4.0
-"""Of a difference in colour against one in place, when pairs are chosen."""
+NEIGHBOURS = 8  # with which a Gaussian may be merged
+COLOR = 4.0  # of a difference in colour against one in place, when pairs are chosen
 MOST_OPAQUE = 0.99
 WIDER = 0.25
 """Of what would be more than opaque, as a power, how much makes a Gaussian wider. 1 keeps a wall as opaque

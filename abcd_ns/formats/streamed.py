@@ -17,8 +17,7 @@ from abcd_ns.formats.levels import coarser
 from abcd_ns.formats.packed import MOST_SOG, packed
 from abcd_ns.formats.ply import GENERATOR
 
-LEVELS = 5
-"""Each has half as many Gaussians as the one before."""
+LEVELS = 5  # each has half as many Gaussians as the one before
 
 
 def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool = False) -> list[Path]:

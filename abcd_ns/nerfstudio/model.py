@@ -10,7 +10,6 @@ import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.engine.callbacks import TrainingCallback
 from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
@@ -352,7 +351,3 @@ class AbcdModel(SplatfactoModel):
     def get_gt_img(self, image: Tensor) -> Tensor:
         """A photo as float32 in 0..1 on the device; photos of samples are float already."""
         return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
-
-    def get_training_callbacks(self, *_: Any, **__: Any) -> list[TrainingCallback]:
-        """None: the pipeline's drive the coordinator."""
-        return []

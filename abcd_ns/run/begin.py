@@ -94,16 +94,11 @@ def begin_run(
     remote: RemoteWorkers | None = None,
     start: Start | None = None,
 ) -> Trainer:
-    """The training run that options describe, on a capture, ready for its next step.
+    """The training run that options describe, on a capture, ready for its next step. Its store is in
+    `folder`; for `params` and `optimizers` see TrainingRun. `remote` starts workers where they cannot be
+    forked. `start` is what it resumes; None for a new run.
 
-    Args:
-        folder: for its store.
-        params, optimizers: see TrainingRun.
-        remote: starts workers where they cannot be forked; None for a run that has no such workers.
-        start: what it resumes; None for a new run.
-
-    Raises:
-        UserError: nothing fits on the device, or `start` was made for something else.
+    A UserError if nothing fits on the device, or `start` was made for something else.
     """
     device_bytes = fit.device_budget(options.device_budget_gb, device)
     rasterizer.warm_up()

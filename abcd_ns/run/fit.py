@@ -173,11 +173,8 @@ def find_fit(
     budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = "--pipeline.device-budget-gb"
 ) -> Fit:
     """The fewest blocks whose visits stay within `budget` bytes. Where whole views leave no room, steps draw
-    parts. One block needs no room for layers.
-
-    Raises:
-        UserError: no block worth a visit fits; names values of the options `downscale` and `memory` that do.
-    """
+    parts. One block needs no room for layers. A UserError if no block worth a visit fits; it names values of
+    the options `downscale` and `memory` that do."""
     each = list(demand.with_fewer_harmonics())
     if (fit := _best(_fit(budget, one) for one in each)) is None:
         raise UserError(_refusal(budget, each[-1], downscale, memory))

@@ -8,19 +8,14 @@ import viser
 from abcd_ns.viewer.images import curve_image
 from abcd_ns.viewer.pictures import Show
 
-FOLLOW = "the one in training"
-"""The entry of the list of blocks that stands for whichever is active."""
+FOLLOW = "the one in training"  # the entry of the list of blocks that stands for whichever is active
 CURVE = "PSNR of training crops in dB over seconds of training"
 
 
 class Controls:
-    """A folder of controls; texts are sent only when they change.
-
-    Args:
-        order: place in the sidebar.
-        changed: called in a thread of viser's when the user has chosen something.
-        trains: whether a run is under way; else a finished scene is shown.
-    """
+    """A folder of controls, at `order` in the sidebar; texts are sent only when they change. `changed` is
+    called in a thread of viser's when the user has chosen something. `trains` is whether a run is under way;
+    else a finished scene is shown."""
 
     def __init__(self, gui: viser.GuiApi, order: float, changed: Callable[[], None], trains: bool) -> None:
         self._gui, self._trains = gui, trains

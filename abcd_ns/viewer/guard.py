@@ -32,16 +32,12 @@ import msgspec
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-THIS_MACHINE = "127.0.0.1"
-"""The host to listen on: reached from this machine alone."""
+THIS_MACHINE = "127.0.0.1"  # the host to listen on: reached from this machine alone
 WILDCARDS = ("0.0.0.0", "::", "")
 """Hosts that a server binds to in order to be reached under all addresses of the machine."""
-SHARE_DOMAIN = ".share.viser.studio"
-"""Names under which viser's public tunnel makes a viewer available."""
-ASPECTS = (0.01, 100.0)
-"""Width over height of a window that pictures are drawn for."""
-LARGEST = 1e9
-"""Numbers of a client must be below this."""
+SHARE_DOMAIN = ".share.viser.studio"  # names under which viser's public tunnel makes a viewer available
+ASPECTS = (0.01, 100.0)  # width over height of a window that pictures are drawn for
+LARGEST = 1e9  # numbers of a client must be below this
 
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::[0-9]{1,5})?")
 # Every segment begins with something else than a dot. No percent sign, backslash, control character or //.
@@ -61,12 +57,9 @@ REMEDY = (
 class Rules:
     """What one server answers to."""
 
-    host: str
-    """The name or address that it listens on."""
-    share: bool = False
-    """Whether viser's public tunnel may be used."""
-    element: Callable[[str], Any] = lambda _: None
-    """Returns a GUI element of viser's by its id, or None."""
+    host: str  # the name or address that it listens on
+    share: bool = False  # whether viser's public tunnel may be used
+    element: Callable[[str], Any] = lambda _: None  # returns a GUI element of viser's by its id, or None
 
     def refusal(self, path: str, headers: Any) -> str | None:
         """Why a request is refused, for a person to read; None if it is answered."""

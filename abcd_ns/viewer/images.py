@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-WIDTH = 260
-"""Of the panel, px."""
-MOST_POINTS = 400
-"""Of a curve; of more, an evenly spaced choice is drawn."""
+WIDTH = 260  # of the panel, px
+MOST_POINTS = 400  # of a curve; of more, an evenly spaced choice is drawn
 LINE, GRID, TEXT = "#ffd369", "#3a3f4b", "#c1c2c5"
 
 

@@ -32,20 +32,15 @@ AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.Prune
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 10.0
 HANDOVER_SECONDS = 0.002
-MOST_POINTS = 2000
-"""Gaussians of a block that tell which cameras see it."""
+MOST_POINTS = 2000  # Gaussians of a block that tell which cameras see it
 
 
 class AbcdPanel(ViewerControl):
-    """Shows where a run stands, and lets the user choose what is drawn.
+    """Shows where a run stands, and lets the user choose what is drawn of `model`, an AbcdModel. `views`
+    returns the training views, `photo` that of a view by its index, uint8 [h, w, c].
 
     nerfstudio finds it as an attribute of the pipeline and calls `_setup`. All else happens under the
     training lock: events come from the training thread, which holds it, and the user's choices take it.
-
-    Args:
-        model: an AbcdModel.
-        views: returns the training views.
-        photo: returns the photo of a view by its index, uint8 [h, w, c].
     """
 
     def __init__(self, model: Any, views: Callable[[], list[View]], photo: Callable[[int], Tensor]) -> None:
@@ -56,12 +51,10 @@ class AbcdPanel(ViewerControl):
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
         self._photo_of: int | None = None
-        self._stage = ""
-        """What is done between steps."""
+        self._stage = ""  # what is done between steps
         self._workers: tuple[events.WorkerSeen, ...] = ()
         self._over = False
-        self._laid_out = 0
-        """Blocks that have boxes and entries in the list."""
+        self._laid_out = 0  # blocks that have boxes and entries in the list
         self._bounds: Box | None = None
         self._training_views: list[View] = []
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None

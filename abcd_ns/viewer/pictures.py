@@ -20,10 +20,8 @@ from abcd_ns.engine.types import Gaussians, View
 
 MOST_PIXELS = 2048 * 2048
 """Of a picture for the viewer, whatever size a client asks for; nerfstudio's slider ends there."""
-FAR = 1e4
-"""Depth of pictures that have none; world units."""
-SECONDS_TO_END = 10.0
-"""For pictures that are being drawn when the process ends."""
+FAR = 1e4  # depth of pictures that have none; world units
+SECONDS_TO_END = 10.0  # for pictures that are being drawn when the process ends
 
 
 class Show(str, Enum):
@@ -41,8 +39,7 @@ class Choice:
     """What the user chose to see. Written by the panel, read where pictures are drawn."""
 
     show: Show = Show.EVERYTHING
-    block: int | None = None
-    """None follows the block in training."""
+    block: int | None = None  # None follows the block in training
 
 
 def asked_by_viewer() -> bool:
@@ -83,8 +80,7 @@ class BlockPictures:
     renderer: LayerRenderer
     view: View
     settings: RenderSettings
-    window_weight: float = 0.0
-    """See TrainingConfig: F and B are cut as training cuts them."""
+    window_weight: float = 0.0  # see TrainingConfig: F and B are cut as training cuts them
 
     @torch.no_grad()
     def draw(self, show: Show, block: int | None) -> Raster:

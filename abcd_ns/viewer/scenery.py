@@ -15,10 +15,8 @@ from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.types import View, centers_of
 from abcd_ns.viewer.texts import Status
 
-SCENE_SCALE = 10.0
-"""Units of nerfstudio's viewer in a world unit."""
-MARGIN = 0.1
-"""Of the outermost boxes beyond 90% of the points on each axis, as a share of these."""
+SCENE_SCALE = 10.0  # units of nerfstudio's viewer in a world unit
+MARGIN = 0.1  # of the outermost boxes beyond 90% of the points on each axis, as a share of these
 GAP = 0.004
 """Between the boxes of neighbours, as a share of the bulk's diagonal: faces that coincide would flicker."""
 _PATH = (0, 4, 6, 2, 0, 1, 5, 4, 5, 7, 6, 7, 3, 2, 3, 1)
@@ -30,12 +28,9 @@ COLORS = {
     Status.DONE: (40, 190, 140),
     Status.UNDER_OBSERVED: (235, 70, 70),
 }
-MOST_LABELS = 64
-"""Blocks that get their number in the scene; with more they would hide it."""
-MOST_FRUSTA = 200
-"""Cameras shown at a time; evenly chosen of more."""
-LIFT = 0.15
-"""How far above a camera a browser looks from at first, as a share of the distance."""
+MOST_LABELS = 64  # blocks that get their number in the scene; with more they would hide it
+MOST_FRUSTA = 200  # cameras shown at a time; evenly chosen of more
+LIFT = 0.15  # how far above a camera a browser looks from at first, as a share of the distance
 SEEN_SHARE = 0.05
 """Share of a block's Gaussians that must lie in a view's image for it to count as one that sees the block."""
 
@@ -46,8 +41,7 @@ class Scenery:
     def __init__(self, scene: viser.SceneApi, frustum_scale: float) -> None:
         self._scene, self._frustum_scale = scene, frustum_scale
         self._boxes: dict[int, Box] = {}
-        self._drawn: dict[int, tuple[Status, bool]] = {}
-        """By block, its state and whether its box is visible."""
+        self._drawn: dict[int, tuple[Status, bool]] = {}  # by block, its state and whether its box is visible
         self._frusta: list[viser.SceneNodeHandle] = []
 
     def set_boxes(self, boxes: Mapping[int, Box]) -> None:

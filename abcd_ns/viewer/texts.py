@@ -16,12 +16,10 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.guard import THIS_MACHINE
 
-MOST_ROWS = 24
-"""Of the table of blocks; with more blocks those that are active or under-observed come first."""
+MOST_ROWS = 24  # of the table of blocks; with more blocks those that are active or under-observed come first
 CONTAINER_MARKS = (Path("/.dockerenv"), Path("/run/.containerenv"))
 """What docker and podman leave in their containers."""
-FORWARD = 0.5
-"""Time of drawing a picture, in steps, which draw it backward, too."""
+FORWARD = 0.5  # time of drawing a picture, in steps, which draw it backward, too
 
 
 class Status(str, Enum):
@@ -40,12 +38,9 @@ class BlockRow:
 
     block: int
     status: Status
-    gaussians: int | None = None
-    """None while a coarse model of all blocks is trained."""
-    psnr: float | None = None
-    """Of the training crops in the later half of its last visit, dB."""
-    views: int | None = None
-    """Worth training it on; None while that is unknown."""
+    gaussians: int | None = None  # None while a coarse model of all blocks is trained
+    psnr: float | None = None  # of the training crops in the later half of its last visit, dB
+    views: int | None = None  # worth training it on; None while that is unknown
 
 
 def status_of(block: int, state: RunState, active: Collection[int]) -> Status:

@@ -11,10 +11,9 @@ from rich.console import Console
 from abcd_ns.arguments import check_ranges
 from abcd_ns.cli.check.survey import Survey, survey
 from abcd_ns.cli.findings import Finding, error, note, print_findings, warning
-from abcd_ns.data import OPTION
+from abcd_ns.data import DOWNSCALE, OPTION
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.photos import default_budget
-from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.data.scene import Lens
 from abcd_ns.engine.train.memory import parameter_bytes
 from abcd_ns.terminal import few, print_facts, print_plain

@@ -32,11 +32,8 @@ LINES_KEPT = 64
 
 class RunLog:
     """Listens to a coordinator and writes its events down. If the disk refuses, it says so once and ends.
-
-    Args:
-        meters: of what is kept in memory, by name: a function for the bytes in use, and their limit.
-        earlier: the log of the run that is resumed; may be the same.
-    """
+    `meters` are of what is kept in memory, by name: a function for the bytes in use, and their limit.
+    `earlier` is the log of the run that is resumed; it may be the same."""
 
     def __init__(
         self,
