@@ -19,13 +19,12 @@ from abcd_ns import methods
 from abcd_ns.arguments import Number, check_ranges
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
-from abcd_ns.engine.render import Shot, make_rasterizer
-from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, needs_of
 from abcd_ns.engine.train.schedule import evenly, views_per_step
-from abcd_ns.engine.train.step.batch import part_to_draw
+from abcd_ns.engine.train.step.batch import Sample, part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
@@ -298,20 +297,16 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
     rasterizer = make_rasterizer("auto", gaussians.device, primitive=training.primitive)
     rasterizer.warm_up()
     leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
-    best = float("inf")
+    best, black = float("inf"), torch.zeros(3, device=gaussians.device)
     for step in range(TIMED_STEPS):
         began = clock()
-        shots = [Shot(v, part_to_draw(training, v.full, step, k)) for k, v in enumerate(views)]
+        crops = [part_to_draw(training, view.full, step, place) for place, view in enumerate(views)]
+        samples = [Sample(*drawn, None, None, black) for drawn in zip(views, crops, strict=True)]
+        shots = [sample.shot for sample in samples]
         rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
         losses = [
-            photometric_loss(
-                raster.color,
-                torch.zeros_like(raster.color),
-                full_pixels=shot.view.full.pixels,
-                full_windows=ssim_windows(shot.view.height, shot.view.width),
-                ssim_lambda=training.ssim_lambda,
-            )
-            for shot, raster in zip(shots, rasters, strict=True)
+            sample.loss(raster.color, torch.zeros_like(raster.color), training)
+            for sample, raster in zip(samples, rasters, strict=True)
         ]
         torch.stack(losses).mean().backward()
         if gaussians.device.type == "cuda":
