@@ -26,10 +26,8 @@ from abcd_ns.viewer.texts import clock
 
 SCENE = {"count": 56, "size": (256, 192), "points": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
-MARKER = "abcd-demo.txt"
-"""Marks a folder that this command made."""
-NEVER = 10**9
-"""Steps between checkpoints and evaluations: the seconds end the run, and its end has both."""
+MARKER = "abcd-demo.txt"  # marks a folder that this command made
+NEVER = 10**9  # steps between checkpoints and evaluations: the seconds end the run, and its end has both
 
 
 def demo(

@@ -14,10 +14,8 @@ from abcd_ns.terminal import print_plain
 Level = Literal["error", "warning", "note"]
 STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 """Of the levels' titles, the most serious first."""
-SHOWN = 20
-"""Findings of one level that are printed; the others are counted."""
-WIDEST = 110
-"""Columns at which text is wrapped at the latest."""
+SHOWN = 20  # findings of one level that are printed; the others are counted
+WIDEST = 110  # columns at which text is wrapped at the latest
 
 
 @dataclass(frozen=True)

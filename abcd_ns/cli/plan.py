@@ -34,10 +34,8 @@ from abcd_ns.run.fit import Demand, Fit, RamShares, blocks_to_begin_with, device
 from abcd_ns.terminal import many, print_facts
 from abcd_ns.units import bytes_in_words
 
-STATES = 3
-"""Parameters and two moments are kept of each Gaussian."""
-GENERATIONS = 2
-"""Of the store on disk: the one in use, and the one that the last checkpoint pins."""
+STATES = 3  # parameters and two moments are kept of each Gaussian
+GENERATIONS = 2  # of the store on disk: the one in use, and the one that the last checkpoint pins
 TIMED_STEPS = 3
 PLACES = {
     "device": ("on the device", "may be taken", "leave --blocks out, or give more of them"),
@@ -45,8 +43,7 @@ PLACES = {
     "disk": ("of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
 }
 """Where memory is needed, and the words for a lack of it, with the fix."""
-DAY = 24
-"""Hours from which on a forecast names ways to take less."""
+DAY = 24  # hours from which on a forecast names ways to take less
 LOST = {1 / 4: 0.9, 1 / 8: 2.0, 1 / 16: 3.3}
 """dB below one block, by the share of its memory for Gaussians that a block has. The most of four scenes, 160
 px wide (docs/results/README.md)."""

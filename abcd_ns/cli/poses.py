@@ -29,15 +29,12 @@ from abcd_ns.terminal import few, print_plain
 
 WORK = "poses.part"
 """The folder in which models are made; a command that is killed leaves it, the next one removes it."""
-FEWEST, MANY = 3, 400
-"""Photos: fewer are refused; with more, comparing each with each takes hours."""
-ENOUGH = 0.9
-"""Once this share of the photos has a pose, no other focal length is tried."""
+FEWEST, MANY = 3, 400  # photos: fewer are refused; with more, comparing each with each takes hours
+ENOUGH = 0.9  # once this share of the photos has a pose, no other focal length is tried
 FOCAL_FACTORS = (1.2, 0.72, 0.5)
 """Initial focal lengths, by the photo's longer side, where EXIF has none: COLMAP's own guess, a phone's main
 camera, a wide one. Bundle adjustment finds the true one from a start that is not too far off."""
-OVERLAP = 12
-"""Photos of a video are matched with that many that follow, and with some farther on."""
+OVERLAP = 12  # photos of a video are matched with that many that follow, and with some farther on
 
 Order = Literal["any", "video"]
 

@@ -16,8 +16,7 @@ from abcd_ns.data.input_errors import InputError
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"})
 """What counts as a photo when a folder is listed."""
 
-UNPOSED = frozenset({".webp"})
-"""Of these, what COLMAP does not read."""
+UNPOSED = frozenset({".webp"})  # of these, what COLMAP does not read
 UNREAD = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"})
 """Pictures that cameras and phones write, and nothing here reads."""
 

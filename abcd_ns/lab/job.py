@@ -16,16 +16,13 @@ Method = Literal[
     "splatfacto",
     "splatfacto-scaled",
 ]
-METHODS: tuple[str, ...] = get_args(Method)
-"""In the order in which tables and charts show them."""
+METHODS: tuple[str, ...] = get_args(Method)  # in the order in which tables and charts show them
 HELD_OUT_EVERY = 8
 """One view in so many is never trained on: 0, 8, 16, ... of the list sorted by name, as in the papers of the
 field, or a sector."""
 HoldOut = Literal["auto", "interval", "sector"]
-LONGEST = 200
-"""Bytes of a folder's name; file systems take 255, and the seed follows."""
-AS_IT_IS = "default"
-"""Name of the variant without changes."""
+LONGEST = 200  # bytes of a folder's name; file systems take 255, and the seed follows
+AS_IT_IS = "default"  # name of the variant without changes
 
 
 def scene_name(path: str) -> str:

@@ -33,8 +33,7 @@ from abcd_ns.nerfstudio.flags import hidden, shown
 from abcd_ns.nerfstudio.views import place_cameras
 from abcd_ns.units import GIB
 
-BATCH = "abcd_batch"
-"""The key of a camera's metadata that holds what the model trains on."""
+BATCH = "abcd_batch"  # the key of a camera's metadata that holds what the model trains on
 TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
 """What readers raise where data is not what they expect."""
 

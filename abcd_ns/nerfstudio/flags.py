@@ -19,8 +19,7 @@ from torch import Tensor
 from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
 
-METHODS = "abcd"
-"""Start of the names of all our methods."""
+METHODS = "abcd"  # start of the names of all our methods
 UNUSED_OF_VIEWER = {
     "num_rays_per_chunk": "it is about rays, and Gaussians are not drawn by rays",
     "relative_log_filename": "the viewer writes no log",

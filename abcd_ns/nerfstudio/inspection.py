@@ -19,8 +19,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
 from abcd_ns.nerfstudio.model import AbcdModelConfig
 
-SOME_MEANS = 1000
-"""Of a file's Gaussians that are looked for among the points."""
+SOME_MEANS = 1000  # of a file's Gaussians that are looked for among the points
 
 
 @dataclass(frozen=True)

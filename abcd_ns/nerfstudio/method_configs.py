@@ -9,8 +9,7 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
 
-ALONE = 0.01
-"""3DGS's share that the rate of means falls to, where no other rate falls."""
+ALONE = 0.01  # 3DGS's share that the rate of means falls to, where no other rate falls
 PAPER = TrainingConfig(
     recipe=Recipe(
         ownership="means",

@@ -41,10 +41,8 @@ from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
-SCORING_SHARE = 0.05
-"""Of a run's training time, for scores of held-out views: half of it before the end."""
-LEAST_SCORED = 32
-"""Held-out views that a score is the mean of, at least."""
+SCORING_SHARE = 0.05  # of a run's training time, for scores of held-out views: half of it before the end
+LEAST_SCORED = 32  # held-out views that a score is the mean of, at least
 
 
 @shown(

@@ -2,5 +2,4 @@
 
 STATE = "abcd"
 """The folder of a run that holds all that is ours; `ns-train` has `nerfstudio_models` beside it."""
-STORE = "store"
-"""The stored blocks, in STATE."""
+STORE = "store"  # the stored blocks, in STATE

@@ -31,10 +31,8 @@ from abcd_ns.run.options import RunOptions
 
 LOG = logging.getLogger("abcd_ns")
 
-Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]
-"""0..255 as integers, or 0..1."""
-BRIGHTEST = 2.0
-"""Of real numbers that are taken for 0..1; some filters go beyond 1."""
+Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]  # 0..255 as integers, or 0..1
+BRIGHTEST = 2.0  # of real numbers that are taken for 0..1; some filters go beyond 1
 
 
 @dataclass(frozen=True)

@@ -20,21 +20,17 @@ from abcd_ns.machine import threads_wanted
 from abcd_ns.run.options import RunOptions
 from abcd_ns.units import GIB, bytes_in_words
 
-EXPECTED_GROWTH = 5
-"""Gaussians at the end for each initial point, where no limit is set; for forecasts only."""
-FREE_SHARE = 0.9
-"""Of a GPU's free memory: the rest is for what the allocator cannot use."""
+EXPECTED_GROWTH = 5  # Gaussians at the end for each initial point, where no limit is set; for forecasts only
+FREE_SHARE = 0.9  # of a GPU's free memory: the rest is for what the allocator cannot use
 LEAST_BLOCK, LEAST_LIMIT = 1_000, 100
 """Gaussians: a block with room for fewer is not worth a visit. The second holds for `gaussian_bytes`."""
-FEW = 4
-"""Blocks: each step trains one, so where there would be more, fewer harmonics make them fewer."""
+FEW = 4  # blocks: each step trains one, so where there would be more, fewer harmonics make them fewer
 PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
-LEAST_CROP = 250_000
-"""Pixels: smaller parts of a view are mostly border."""
+LEAST_CROP = 250_000  # pixels: smaller parts of a view are mostly border
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
-COARSE_MODEL = "coarse_gaussians"
 """The limits that follow from the device's memory; a run keeps them."""
+COARSE_MODEL = "coarse_gaussians"  # a limit that is kept likewise, on the coarse model
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one stored."""
 

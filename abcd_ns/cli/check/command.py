@@ -22,19 +22,15 @@ from abcd_ns.units import bytes_in_words
 MIDDLE = (0.05, 0.95)
 """Quantiles between which the points' extent is taken: single wrong ones would decide it otherwise."""
 FEW_PHOTOS, FEW_POINTS, FEW_POINTS_IN_VIEW = 8, 500, 20
-DARK, BRIGHT = 0.02, 0.98
-"""Mean luma beyond which a photo shows nothing."""
+DARK, BRIGHT = 0.02, 0.98  # mean luma beyond which a photo shows nothing
 EXPOSURES = 3.0
 """Largest ratio of mean lumas, the brightest and darkest twentieth left out, that one exposure explains. A
 room with windows (bonsai, of Mip-NeRF 360) has 2.3."""
-SMALL_BASELINE = 0.02
-"""Extent of the cameras, as a share of the median depth, below which depth is a guess."""
+SMALL_BASELINE = 0.02  # extent of the cameras, as a share of the median depth, below which depth is a guess
 FAR_CAMERA, FAR_POINT = 10.0, 100.0
 """Distance from the middle, by that of three quarters of the cameras or of nine tenths of the points."""
-FIELDS = 3.0
-"""Ratio of angles of view beyond which one of them is doubtful."""
-UNSEEN = 0.05
-"""Share of the points that may lie in no picture."""
+FIELDS = 3.0  # ratio of angles of view beyond which one of them is doubtful
+UNSEEN = 0.05  # share of the points that may lie in no picture
 
 
 def check(*, data: Path, downscale: int | None = None) -> int:

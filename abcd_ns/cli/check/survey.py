@@ -21,8 +21,7 @@ from abcd_ns.progress_bar import tracked
 
 REDUCED = (64, 64)
 """JPEG photos are decoded at an eighth of their size, or a larger one of at least this many pixels."""
-MOST_POINTS = 20_000
-"""Of more points, an evenly spaced choice is projected."""
+MOST_POINTS = 20_000  # of more points, an evenly spaced choice is projected
 
 
 @dataclass(frozen=True)

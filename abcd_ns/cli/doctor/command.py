@@ -11,17 +11,13 @@ from abcd_ns.machine import without_home
 from abcd_ns.terminal import many, print_facts
 from abcd_ns.units import GIB, bytes_in_words
 
-MAIN = ("torch", "nerfstudio", "gsplat", "viser")
-"""Packages whose versions are always shown."""
+MAIN = ("torch", "nerfstudio", "gsplat", "viser")  # packages whose versions are always shown
 DETAILS = ("os", "driver", "torch_cuda", "lpips_missing")
 """Facts that only --verbose shows, beside the other packages' versions."""
-TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
-"""Versions whose insides are relied on."""
-LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
-"""Free bytes below which runs of usual size end early."""
+TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}  # versions whose insides are relied on
+LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB  # free bytes below which runs of usual size end early
 SYSTEM_LIBRARIES = "sudo apt-get install libgl1 libegl1 libgomp1 libusb-1.0-0 libx11-6"
-NMS = "torchvision::nms"
-"""In the error of a torchvision that was built for another torch."""
+NMS = "torchvision::nms"  # in the error of a torchvision that was built for another torch
 
 
 def doctor(*, verbose: bool = False) -> int:

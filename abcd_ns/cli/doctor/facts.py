@@ -25,10 +25,8 @@ from abcd_ns.units import bytes_in_words
 
 PACKAGES = ("torch", "torchvision", "nerfstudio", "gsplat", "viser", "pycolmap", "numpy", "pillow")
 """Distributions that training needs."""
-OURS = "abcd_ns.nerfstudio.method_configs"
-"""The module that brings nerfstudio."""
-EXPORT = "open3d"
-"""What `ns-export` and `abcd mesh` need besides; heavy, so imported in a process of its own."""
+OURS = "abcd_ns.nerfstudio.method_configs"  # the module that brings nerfstudio
+EXPORT = "open3d"  # what `ns-export` and `abcd mesh` need besides; heavy, so imported in a process of its own
 STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", OURS, EXPORT)
 """Modules that are imported, each after what it needs."""
 COMPILER = "C++ compiler"

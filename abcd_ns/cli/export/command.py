@@ -27,8 +27,7 @@ from abcd_ns.units import bytes_in_words
 
 TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file with the transform from the data's frame to the run's."""
-LOST_DIGITS = 1e-4
-"""Rounding errors above this share of the scene's size are printed."""
+LOST_DIGITS = 1e-4  # rounding errors above this share of the scene's size are printed
 
 
 def export(

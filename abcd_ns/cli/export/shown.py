@@ -19,8 +19,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.formats.scene_file import shows
 from abcd_ns.run.store import MADE_FOR
 
-Box = tuple[float, float, float, float, float, float]
-"""x, y and z of its lower and then of its upper corner."""
+Box = tuple[float, float, float, float, float, float]  # x, y and z of its lower and then of its upper corner
 
 
 def inside(box: Box, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:

@@ -37,8 +37,7 @@ from abcd_ns.units import bytes_in_words
 VOXEL_PIXELS = 2.0
 """The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
 STAY = Frame(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
-MANY = 0.01
-"""Share of the pixels that may be left out without a warning."""
+MANY = 0.01  # share of the pixels that may be left out without a warning
 
 
 def mesh(

@@ -12,10 +12,8 @@ from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.types import View
 from abcd_ns.progress_bar import tracked
 
-LEAST_OPACITY = 0.5
-"""Of a pixel whose depth counts."""
-SAMPLES = 1000
-"""Pixels of a view by which footprints are known."""
+LEAST_OPACITY = 0.5  # of a pixel whose depth counts
+SAMPLES = 1000  # pixels of a view by which footprints are known
 
 
 class DepthMaps:

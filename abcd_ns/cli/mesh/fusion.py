@@ -22,19 +22,15 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
 from abcd_ns.progress_bar import ProgressBar, tracked
 
-BOX = 16
-"""Side of a box, voxels."""
+BOX = 16  # side of a box, voxels
 PART_BOXES = 4096
 """About as many as a part has, those around it left out: 0.3 GiB, and as much while vertices are found."""
 TRUNCATION = 8.0
 """How far from what a view sees it has a say, voxels; open3d's own. Views that disagree by more than twice
 that leave a hole."""
-LEAST_VIEWS = 3
-"""That must see a place for it to be a part of the surface."""
-STRIDE = 4
-"""open3d looks at every fourth pixel, each way, to see where boxes are needed."""
-FAR = BOX / STRIDE
-"""Voxels that a pixel may cover: with more, boxes would be missed."""
+LEAST_VIEWS = 3  # that must see a place for it to be a part of the surface
+STRIDE = 4  # open3d looks at every fourth pixel, each way, to see where boxes are needed
+FAR = BOX / STRIDE  # voxels that a pixel may cover: with more, boxes would be missed
 
 
 class Fusion:

@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from abcd_ns.formats.ply import GENERATOR
 
-SPECK = 0.001
-"""Clusters with fewer faces than this share of the largest one's are left out."""
+SPECK = 0.001  # clusters with fewer faces than this share of the largest one's are left out
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,10 @@ from abcd_ns.nerfstudio.run.log_lines import SampleLine, TrainingLine
 from abcd_ns.units import GIB
 from abcd_ns.viewer.images import data_uri
 
-WIDTH, HEIGHT = 8.0, 2.6
-"""Inches."""
-SMOOTHED = 0.06
-"""Share of the samples that each point of a smoothed line is the mean of."""
+WIDTH, HEIGHT = 8.0, 2.6  # inches
+SMOOTHED = 0.06  # share of the samples that each point of a smoothed line is the mean of
 STEPS, LAYERS, QUIET = "#0072b2", "#d55e00", "#767676"
-SHOWN = (0.03, 0.97)
-"""Quantiles of the Gaussians between which a map reaches, and beyond where cameras are."""
+SHOWN = (0.03, 0.97)  # quantiles of the Gaussians between which a map reaches, and beyond where cameras are
 BINS = 160
 
 

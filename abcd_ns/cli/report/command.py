@@ -29,8 +29,7 @@ from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.terminal import print_plain
 from abcd_ns.units import bytes_in_words
 
-GENERATOR = "abcd report"
-"""Begins the page's generator, by which a page of ours is known."""
+GENERATOR = "abcd report"  # begins the page's generator, by which a page of ours is known
 HERE = Path(__file__).parent
 
 

@@ -18,10 +18,8 @@ from abcd_ns.viewer.images import data_uri
 
 PAGE_PIXELS = 6_000_000
 """Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MiB."""
-FOG_VIEWS = 16
-"""Training views, at most, that fog is looked for in."""
-LOSSLESS_PIXELS = 40_000
-"""Pictures no larger than this are PNG: JPEG would spoil what little there is."""
+FOG_VIEWS = 16  # training views, at most, that fog is looked for in
+LOSSLESS_PIXELS = 40_000  # pictures no larger than this are PNG: JPEG would spoil what little there is
 
 
 @dataclass(frozen=True)

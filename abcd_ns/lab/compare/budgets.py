@@ -16,12 +16,9 @@ from abcd_ns.units import MIB
 
 JOINT = "abcd-monolithic"
 """Of what this takes, budgets are shares; within one it has as many Gaussians as fit."""
-WITHIN = ("abcd", JOINT, "abcd-ablated", "abcd-partition")
-"""Methods that keep to a budget."""
-ALONE = ("splatfacto", "splatfacto-scaled")
-"""Ceilings, which keep to none."""
-OPTION = "gaussian_bytes"
-"""That sets a budget."""
+WITHIN = ("abcd", JOINT, "abcd-ablated", "abcd-partition")  # methods that keep to a budget
+ALONE = ("splatfacto", "splatfacto-scaled")  # ceilings, which keep to none
+OPTION = "gaussian_bytes"  # that sets a budget
 QUALITY = {"psnr_merged": "held-out PSNR (dB)", "ssim_merged": "held-out SSIM"}
 """By field of a run, what the chart shows of it."""
 

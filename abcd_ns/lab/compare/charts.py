@@ -13,10 +13,8 @@ from abcd_ns.lab.results.results import Arm, CurvePoint, Results, Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, lay_grid, save
 from abcd_ns.units import MIB
 
-Along = Callable[[CurvePoint], float]
-"""What lies along the axis of x."""
-PALEST = 0.55
-"""Share of white in the colour of a method's last arm."""
+Along = Callable[[CurvePoint], float]  # what lies along the axis of x
+PALEST = 0.55  # share of white in the colour of a method's last arm
 
 
 @in_style

@@ -101,8 +101,7 @@ DEFAULTS = Options(
 )
 TERRAIN_DEFAULTS = Options(methods=("abcd",), seeds=(0,), tile_gaussians=20_000, visits=3)
 TERRAIN_OPTIONS = {*TERRAIN_DEFAULTS.given, "tiles", "out"}
-BYTES_PER_GAUSSIAN = 3 * 59 * 4
-"""On disk: parameters and two moments in float32."""
+BYTES_PER_GAUSSIAN = 3 * 59 * 4  # on disk: parameters and two moments in float32
 
 
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)

@@ -9,11 +9,9 @@ from abcd_ns.lab.job import Settings
 from abcd_ns.machine import Machine, Versions
 from abcd_ns.units import bytes_in_words
 
-SCHEMA = 2
-"""Raised whenever a field changes its name or meaning."""
+SCHEMA = 2  # raised whenever a field changes its name or meaning
 RESULTS_FILE = "results.json"
-TERRAIN = "comparison of sizes"
-"""The kind of results of `abcd compare --tiles`, where nothing is held out."""
+TERRAIN = "comparison of sizes"  # the kind of results of `abcd compare --tiles`, where nothing is held out
 
 
 @dataclass(frozen=True)

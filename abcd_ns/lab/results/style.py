@@ -45,8 +45,7 @@ def save(figure: Figure, out: Path, name: str) -> Path:
     return path
 
 
-in_style = matplotlib.rc_context(STYLE)
-"""Decorates a function that draws in the style of all charts."""
+in_style = matplotlib.rc_context(STYLE)  # decorates a function that draws in the style of all charts
 
 
 def lay_grid(axes: Axes) -> None:

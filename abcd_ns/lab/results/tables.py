@@ -20,16 +20,11 @@ from abcd_ns.terminal import print_plain
 from abcd_ns.units import GIB, MIB
 
 TABLE_FILE = "table.md"
-NOTHING = "-"
-"""Stands where there is no value."""
-NEAR_DB = 0.2
-"""How far below the best fewer Gaussians may be and still count as enough."""
-GOAL_GROWTH = 0.05
-"""Growth of peak memory that is allowed from the smallest terrain to the largest."""
-MOST_COLUMNS = 5
-"""Arms that stand beside each other; more stand below each other."""
-Rows = list[list[str]]
-"""Of a table, its titles first."""
+NOTHING = "-"  # stands where there is no value
+NEAR_DB = 0.2  # how far below the best fewer Gaussians may be and still count as enough
+GOAL_GROWTH = 0.05  # growth of peak memory that is allowed from the smallest terrain to the largest
+MOST_COLUMNS = 5  # arms that stand beside each other; more stand below each other
+Rows = list[list[str]]  # of a table, its titles first
 
 
 @dataclass(frozen=True)

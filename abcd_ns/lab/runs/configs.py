@@ -22,8 +22,7 @@ from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
-ENDLESS = 10**9
-"""Steps of a run that its seconds end."""
+ENDLESS = 10**9  # steps of a run that its seconds end
 
 REGISTERED: dict[str, AbcdTrainerConfig] = {
     method: getattr(methods, method.replace("-", "_")).config

@@ -15,8 +15,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import nearest
 from abcd_ns.nerfstudio.run.settings import flat_options
 
-PREFIX = "pipeline."
-"""May stand before a method's option, as in `ns-train`."""
+PREFIX = "pipeline."  # may stand before a method's option, as in `ns-train`
 _SCORED = "it would change the photos that scores are taken from"
 FIXED = {
     "max_seconds": "set it with --seconds",

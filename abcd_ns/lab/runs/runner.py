@@ -28,12 +28,10 @@ from abcd_ns.machine import Machine, describe_machine, describe_versions, peak_d
 from abcd_ns.terminal import print_plain
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
-SCENE = "photos and points"
-"""Of the scene, in the file by which a folder is known."""
+SCENE = "photos and points"  # of the scene, in the file by which a folder is known
 OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
 """How torch and CUDA say it, in the last line of a log."""
-MOST_IN_ONE_BLOCK = 4_000_000
-"""Gaussians; larger terrains are not tried as one block."""
+MOST_IN_ONE_BLOCK = 4_000_000  # Gaussians; larger terrains are not tried as one block
 
 
 def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[Results]:

@@ -31,10 +31,8 @@ from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.run import STORE
 
-RAM_BYTES = 16 << 20
-"""For blocks that were read, smaller than any scene; layers and photos have their own."""
-WHOLE_STEPS = 12
-"""Enough for Adam's moments and the drawing of the largest view to be there."""
+RAM_BYTES = 16 << 20  # for blocks that were read, smaller than any scene; layers and photos have their own
+WHOLE_STEPS = 12  # enough for Adam's moments and the drawing of the largest view to be there
 
 
 def run(job: TerrainJob, folder: Path) -> Run:

@@ -32,12 +32,9 @@ from abcd_ns.run.options import RunOptions
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
 PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
-SH_DEGREE = 1
-"""Nothing in these worlds shines."""
-LIMITED = DensityConfig(max_gaussians=1000)
-"""As many Gaussians for every method, and few, for time."""
-BUDGET = 600
-"""Steps of a run where methods are compared: few, so that what blocks cost shows."""
+SH_DEGREE = 1  # nothing in these worlds shines
+LIMITED = DensityConfig(max_gaussians=1000)  # as many Gaussians for every method, and few, for time
+BUDGET = 600  # steps of a run where methods are compared: few, so that what blocks cost shows
 BLOCKS = 4
 
 

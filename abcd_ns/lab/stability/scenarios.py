@@ -25,12 +25,10 @@ from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Finding, Lab, Scena
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, Wall, World, camera, ring
 
 FEW = 3
-TURN_DEGREES, SHIFT = 0.5, 0.01
-"""Of noisy poses: standard deviations; the shift in distances of the cameras."""
+TURN_DEGREES, SHIFT = 0.5, 0.01  # of noisy poses: standard deviations; the shift in distances of the cameras
 GAIN = 1.5
 FAR = 50.0
-MARGIN = 0.3
-"""dB that a fault may cost ABCD more than one block."""
+MARGIN = 0.3  # dB that a fault may cost ABCD more than one block
 
 
 def with_noisy_poses(stage: Stage) -> Stage:
@@ -105,8 +103,7 @@ def inexact(lab: Lab) -> Finding:
 
 
 VISITS_RISING = 0.05
-RISES_BY = 1e-3
-"""A visit raised the objective if by more than this share of it."""
+RISES_BY = 1e-3  # a visit raised the objective if by more than this share of it
 
 
 @partial(
@@ -145,10 +142,8 @@ def full_error(lab: Lab, stage: Stage, gaussians: Gaussians) -> float:
     )
 
 
-BAND = 4
-"""Pixels to either side of a border."""
-SEAM = 1.2
-"""The error in the band, in errors of the interior, at most."""
+BAND = 4  # pixels to either side of a border
+SEAM = 1.2  # the error in the band, in errors of the interior, at most
 FLOOR = Surfaces((Wall(2, 0.0, 0.8, 0.8),))
 
 
@@ -236,8 +231,7 @@ def blocks_and_cuts(lab: Lab) -> Finding:
     return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
 
 
-FOG = 0.02
-"""Of the screen, in the mean over training views, at most."""
+FOG = 0.02  # of the screen, in the mean over training views, at most
 
 
 @partial(

@@ -17,14 +17,10 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import Seen, World, camera
 
-HEIGHT = 1.1
-"""Of the cameras over the land, in sides of a tile."""
-VIEWS = 4
-"""Cameras over each tile."""
-SIZE = (160, 120)
-"""Of their pictures, pixels."""
-SHIFT = 0.25
-"""How far to either side of its tile's middle a camera stands."""
+HEIGHT = 1.1  # of the cameras over the land, in sides of a tile
+VIEWS = 4  # cameras over each tile
+SIZE = (160, 120)  # of their pictures, pixels
+SHIFT = 0.25  # how far to either side of its tile's middle a camera stands
 WAVES = ((3.1, 1.7, 0.2), (-2.3, 4.1, 1.1), (7.9, -5.3, 2.0), (11.3, 13.7, 0.7))
 """Frequencies along x and y, and phase, of the colours."""
 

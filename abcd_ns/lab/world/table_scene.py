@@ -13,8 +13,7 @@ from abcd_ns.progress_bar import tracked
 
 WORLD = Surfaces(tuple(replace(surface, fineness=4.0) for surface in TABLE.surfaces), seed=1, plain=0.9)
 MODEL = Path("sparse/0")
-LAST = MODEL / "points3D.bin"
-"""A folder with this file is whole."""
+LAST = MODEL / "points3D.bin"  # a folder with this file is whole
 
 
 def draw_table(out: Path, count: int, size: tuple[int, int], points: int) -> None:

@@ -15,11 +15,9 @@ from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.types import Crop, View
 
-WAVES = 5
-"""Sines that a texture is the sum of, for each colour."""
+WAVES = 5  # sines that a texture is the sum of, for each colour
 FAR = 1e9
-RAYS_AT_ONCE = 1 << 17
-"""So many fit into a processor's cache."""
+RAYS_AT_ONCE = 1 << 17  # so many fit into a processor's cache
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.events import EpochEnded, PrunedAtEnd, VisitBegan, WorkerLost
 
-SCHEMA = 2
-"""Raised whenever a line changes its form or meaning."""
+SCHEMA = 2  # raised whenever a line changes its form or meaning
 
 
 @dataclass(frozen=True)

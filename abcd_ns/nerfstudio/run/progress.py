@@ -22,8 +22,7 @@ from abcd_ns.viewer.texts import clock, time_left
 
 SECONDS_BETWEEN_LINES, SECONDS_BETWEEN_LOOKS = 10.0, 0.1
 """Where the output is no terminal, such as a log file, and where it is one."""
-SMOOTHING = 0.98
-"""Weight of the PSNR that was shown before."""
+SMOOTHING = 0.98  # weight of the PSNR that was shown before
 ALARMING = ("gradients", "moments", "values")
 """Repairs that are printed at once; the others are counted for the end."""
 

@@ -24,10 +24,8 @@ from abcd_ns.run.store import Start
 
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
-SAMPLES = 300
-"""Gaps grow to 1 / SAMPLES of the time so far: a day's log is hardly longer than an hour's."""
-LINES_KEPT = 64
-"""Lines that wait in memory for the end of a visit, at most."""
+SAMPLES = 300  # gaps grow to 1 / SAMPLES of the time so far: a day's log is hardly longer than an hour's
+LINES_KEPT = 64  # lines that wait in memory for the end of a visit, at most
 
 
 class RunLog:

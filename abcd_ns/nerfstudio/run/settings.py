@@ -21,8 +21,7 @@ from abcd_ns.machine import Machine, Versions, describe_machine, describe_versio
 from abcd_ns.nerfstudio.datamanager import OUR_READER, reader_name
 
 SETTINGS_FILE = "settings.json"
-SCHEMA = 1
-"""Raised whenever a field changes its name or meaning."""
+SCHEMA = 1  # raised whenever a field changes its name or meaning
 
 Plain = bool | int | float | str | None
 
