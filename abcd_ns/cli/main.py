@@ -15,7 +15,8 @@ from abcd_ns.errors import UserError, missing
 class Command(NamedTuple):
     """A subcommand: `target` is the "module:function" that tyro makes a command line of.
 
-    The function may return an exit code; None is 0. It raises UserError where an option is out of range, what
+    A module is imported in a second or two; nerfstudio, which takes longer, where the options are known to be
+    right. The function may return an exit code; None is 0. It raises UserError where an option is out of range, what
     it is given cannot be used, or what it shall write is there already.
     """
 
@@ -26,13 +27,9 @@ class Command(NamedTuple):
     """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function, or raise a UserError for a missing package. Takes seconds where it needs torch
-        or nerfstudio."""
+        """Import the function."""
         module, function = self.target.split(":")
-        try:
-            return getattr(importlib.import_module(module), function)
-        except ImportError as error:
-            raise UserError(missing(error)) from None
+        return getattr(importlib.import_module(module), function)
 
 
 COMMANDS = (
@@ -103,6 +100,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return run_command(find_command(first), others)
     except UserError as error:
         message = str(error)
+    except ImportError as error:
+        message = missing(error)
     except OSError as error:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         if error.filename is None and not is_full:

@@ -2,4 +2,4 @@
 
 STATE = "abcd"
 """The folder of a run that holds all that is ours; `ns-train` has `nerfstudio_models` beside it."""
-STORE = "store"  # the stored blocks, in STATE
+STORE, SETTINGS_FILE = "store", "settings.json"  # the stored blocks, and a run's options, in STATE

@@ -12,7 +12,8 @@ import torch
 from rich.console import Console
 
 from abcd_ns.cli.check.command import check
-from abcd_ns.cli.plan import LOST, Capture, Forecast, Wanted, forecast, plan, print_forecast
+from abcd_ns.cli.forecast import LOST, Capture, Forecast, forecast, print_forecast
+from abcd_ns.cli.plan import Wanted, plan
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect

@@ -16,7 +16,8 @@ from abcd_ns.engine.events import EpochEnded, HeldOutScored, StepTaken, VisitBeg
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import run_log, settings
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
-from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE, flat_options
+from abcd_ns.nerfstudio.run.settings import flat_options
+from abcd_ns.run import SETTINGS_FILE
 from tests.nerfstudio.test_training import STEPS, configure, run
 
 

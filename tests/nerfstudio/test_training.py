@@ -22,9 +22,9 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.model import AbcdModel
-from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
+from abcd_ns.run import SETTINGS_FILE
 from tests.reference.colmap_scene import HEIGHT, WIDTH
 
 STEPS = 36

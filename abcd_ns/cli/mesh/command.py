@@ -10,28 +10,14 @@ import torch
 import tyro
 
 from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
-from abcd_ns.cli.export.shown import Box, check_trained, inside
+from abcd_ns.cli.export.shown import Box, inside
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
 from abcd_ns.cli.paths import find_run
-from abcd_ns.cli.report.run_folder import pipeline_config
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
-from abcd_ns.engine.render import make_rasterizer
-from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.atomic import replacing
-from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
-from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.options import mirror
-from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
-from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
-from abcd_ns.nerfstudio.views import training_views
-from abcd_ns.run import STORE
-from abcd_ns.run.fit import FREE_SHARE, RamShares
-from abcd_ns.run.store import MadeFor
+from abcd_ns.run import SETTINGS_FILE, STORE
 from abcd_ns.units import bytes_in_words
 
 VOXEL_PIXELS = 2.0
@@ -74,8 +60,11 @@ def mesh(
     _check(out, voxel, box)
     run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
+    from abcd_ns.cli.mesh.views import open_views  # these load nerfstudio, in seconds
+    from abcd_ns.cli.report.run_folder import pipeline_config
+
     with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:
-        maps = DepthMaps(Path(folder), *_seen(store, pipeline_config(run, data)), depth == "median")
+        maps = DepthMaps(Path(folder), *open_views(store, pipeline_config(run, data)), depth == "median")
         surface, side = _fuse(maps, voxel and voxel / to.scale, box, to)
         if not len(surface.faces):
             raise UserError("There is no surface" + (" in this box." if box else " that three views see."))
@@ -122,28 +111,3 @@ def _fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> t
     if (far := float((footprints > FAR * side).mean())) > MANY:
         print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
     return surface, side
-
-
-def _seen(
-    store: ParameterStore, config: AbcdPipelineConfig
-) -> tuple[LayerRenderer, RenderSettings, list[View]]:
-    """What renders the scene, and its training views, as posed in the data."""
-    check_trained(store)
-    mirror(config.training, config.model)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    capture = config.datamanager.setup(device=device, test_mode="test").train_dataset
-    views = training_views(capture.cameras, capture.metadata.get("points3D_xyz"), config.near_plane)
-    if different := MadeFor.of(capture.image_filenames, views, config.training).differences(store):
-        raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
-    ram = RamShares.of(config.ram_budget_gb)
-    scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
-    of_each = drawing_bytes(config.training.sh_degree, config.training.primitive)
-    room = int(FREE_SHARE * free_bytes(device)) // of_each
-    renderer = LayerRenderer(
-        scene,
-        make_rasterizer(config.model.rasterizer, device, primitive=config.training.primitive),
-        ownership="fragments",
-        pass_gaussians=min(default_pass(scene), room),
-        device=device,
-    )
-    return renderer, RenderSettings(config.training.sh_degree, config.training.antialiased), views

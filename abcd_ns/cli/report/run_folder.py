@@ -22,9 +22,9 @@ from abcd_ns.lab.runs.options import set_options
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
-from abcd_ns.run import STATE, STORE
+from abcd_ns.run import SETTINGS_FILE, STATE, STORE
 
 CHECKPOINTS = "nerfstudio_models"
 _DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)

@@ -32,8 +32,6 @@ from abcd_ns.lab.job import (
 from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results, Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
-from abcd_ns.lab.runs.configs import REGISTERED, check_options, check_scene
-from abcd_ns.lab.runs.options import parse_changes
 from abcd_ns.lab.runs.runner import run_jobs, write_report
 from abcd_ns.terminal import print_plain
 from abcd_ns.units import bytes_in_words
@@ -140,6 +138,8 @@ def compare(
     options = options.over(read_options(config)) if config else options
     plan = make_plan(options)
     if plan.kind != TERRAIN:
+        from abcd_ns.lab.runs.configs import check_options, check_scene  # loads nerfstudio, in seconds
+
         for job in plan.jobs:
             check_options(job)
         plan = dataclasses.replace(plan, scene=check_scene(plan.jobs[0]))
@@ -242,6 +242,9 @@ def arms_of(given: Options) -> list[tuple[str, ...]]:
     """What each arm changes: every number of blocks, if there are several, with nothing and with each of
     --vary. A UserError where an option does not exist, or a value does not fit."""
     check_numbers("--blocks", given.blocks, 1)
+    if given.vary:
+        from abcd_ns.lab.runs.configs import REGISTERED  # these load nerfstudio, in seconds
+        from abcd_ns.lab.runs.options import parse_changes
     changes = [parse_changes(text, REGISTERED["abcd"].pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
     of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]

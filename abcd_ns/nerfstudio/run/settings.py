@@ -19,8 +19,8 @@ from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.errors import UserError
 from abcd_ns.machine import Machine, Versions, describe_machine, describe_versions
 from abcd_ns.nerfstudio.datamanager import OUR_READER, reader_name
+from abcd_ns.run import SETTINGS_FILE
 
-SETTINGS_FILE = "settings.json"
 SCHEMA = 1  # raised whenever a field changes its name or meaning
 
 Plain = bool | int | float | str | None

@@ -18,8 +18,8 @@ from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import log_lines
 from abcd_ns.nerfstudio.run.log_lines import KINDS
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings, flat_options
-from abcd_ns.run import STATE
+from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings, flat_options
+from abcd_ns.run import SETTINGS_FILE, STATE
 from tests.lab.compare.records import MACHINE, VERSIONS
 
 TRAINING = {

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from abcd_ns.cli.report.charts import draw_map
-from abcd_ns.cli.report.command import render_page
 from abcd_ns.cli.report.figures import (
     block_rows,
     changed_options,
@@ -20,6 +19,7 @@ from abcd_ns.cli.report.figures import (
     training_command,
 )
 from abcd_ns.cli.report.held_out import HeldOut, pick
+from abcd_ns.cli.report.page import render_page
 from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd

@@ -19,7 +19,7 @@ from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.log_lines import layer_share
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
+from abcd_ns.run import SETTINGS_FILE
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
 
