@@ -50,6 +50,7 @@ class Coordinator(Trainer):
     ) -> None:
         super().__init__(run)
         self.visits, self.room = visits or Planner(run), room or LayerRoom()
+        self.layer_limit = self.room.device + self.room.ram
         self.visit = VisitTraining(run, self.visits, self.room)
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
@@ -61,7 +62,6 @@ class Coordinator(Trainer):
 
     @property
     def batch(self) -> int:
-        """Views in a step, see `VisitTraining.batch`."""
         return self.visit.batch
 
     def next_batch(self) -> Batch:
@@ -76,15 +76,13 @@ class Coordinator(Trainer):
         return self.visit.next_batch()
 
     def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in its parameters."""
         return self.visit.render(batch)
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """What a batch adds to the loss of a step, over what says something about the block."""
         return self.visit.loss(batch, pictures, photos)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """As the trainer's: grows and prunes, and ends the visit when its steps are done."""
+        """Grow and prune, and end the visit when its steps are done."""
         if self.poses is not None:
             self.poses.count(len(rendered.views))
         self.visit.after_step(rendered, errors)
@@ -103,10 +101,10 @@ class Coordinator(Trainer):
 
     def begin_visit(self) -> None:
         """Begin the next one."""
-        self.visit.attach(self.visits.begin())
-        self._read_ahead()
+        self._attach(self.visits.begin())
 
-    def _read_ahead(self) -> None:
+    def _attach(self, active: ActiveVisit) -> None:
+        self.visit.attach(active)
         for plan in self.state.queue[:1]:
             self.scene.read_ahead(plan.block)
 
@@ -115,8 +113,11 @@ class Coordinator(Trainer):
         active = self.run.active
         state = self.visit.finish()
         self.visit.block.let_go()  # a worker, or the next footprints, may need the device's memory
-        if active.is_whole:
-            self._end_warm_up(state)
+        if active.is_whole:  # from now on it is known what views show of which block
+            known, unknown = self.visit.influence.found()
+            self.visit.influence = None  # it holds on to what was active
+            others = self._influence(state, self.scene.tree, sorted(unknown))
+            self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
         updates = commit(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
             updates[ACTIVE] = state.nobody
@@ -137,13 +138,6 @@ class Coordinator(Trainer):
             self.state.pruned_at = self.state.step
             self.run.persist(self.scene.tree, {}, 0.0)
 
-    def _end_warm_up(self, state: BlockState) -> None:
-        """From now on it is known what views show of which block."""
-        known, unknown = self.visit.influence.found()
-        self.visit.influence = None  # it holds on to what was active
-        others = self._influence(state, self.scene.tree, sorted(unknown))
-        self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
-
     def _influence(self, scene: BlockState, tree: BlockTree, views: Iterable[int]) -> Influence:
         """The influence of every block of the whole scene on these views."""
         run, gaussians = self.run, scene.gaussians.to(self.device)
@@ -153,13 +147,7 @@ class Coordinator(Trainer):
     # -- persist and restore -------------------------------------------------------------------------
 
     @property
-    def layer_limit(self) -> int:
-        """Bytes that layers may take, on the device and in RAM."""
-        return self.room.device + self.room.ram
-
-    @property
     def layer_bytes(self) -> int:
-        """Bytes that the layers of the visit that is under way take."""
         return self.visit.layers.nbytes if self.visit.layers else 0
 
     def persist_visit(
@@ -190,8 +178,6 @@ class Coordinator(Trainer):
         self.run.persist(self.scene.tree, updates, within)
 
     def restore(self) -> None:
-        """Go on from the store's newest generation: where `save` was called, or something was persisted."""
         self.run.restore()
         if self.state.active is not None:
-            self.visit.attach(self.state.active)
-            self._read_ahead()
+            self._attach(self.state.active)

@@ -1,10 +1,8 @@
 """Which block is trained next, on which views, and for how many steps."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from statistics import median_high
-
-from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
@@ -12,18 +10,11 @@ from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_train
 from abcd_ns.engine.space.tree import in_float64
 from abcd_ns.engine.space.visibility import ROUNDING, Frusta, Optics
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
+from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, VisitKind
-from abcd_ns.engine.train.schedule import (
-    VisitPlan,
-    passes_of_visit,
-    plan_epoch,
-    views_per_step,
-    views_per_visit,
-    visit_views,
-)
-from abcd_ns.engine.train.step.batch import Batch
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, VisitKind
+from abcd_ns.engine.train.step.batch import Batch, Pictures
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 
@@ -60,12 +51,7 @@ class Visits(ABC):
     def room(self) -> int | None:
         """Gaussians that may be added to the block; None for any number."""
 
-    def compared(
-        self,
-        batch: Batch,  # noqa: ARG002 - all alike
-        pictures: Sequence[Tensor],
-        photos: Sequence[Tensor],
-    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    def compared(self, batch: Batch, pictures: Pictures, photos: Pictures) -> tuple[Pictures, Pictures]:  # noqa: ARG002
         """What the loss compares, pictures and photos as far as they say something about the block: all."""
         return pictures, photos
 
@@ -78,17 +64,17 @@ class Planner(Visits):
         self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
 
-    @property
-    def _state(self) -> RunState:
-        return self._run.state
-
     def begin(self, at_once: int = 1) -> ActiveVisit:
-        """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
-        passed over, and most of the time those that no picture showed when they were last visited. A
-        BlocksBusyError if the blocks that are left in this epoch are in flight."""
-        run, state = self._run, self._state
+        """The warm-up, or a visit to the next block that some view sees; most of the time blocks are passed
+        over that no picture showed when they were last visited. A BlocksBusyError if the blocks that are left
+        in this epoch are in flight."""
+        run, state = self._run, self._run.state
         began = run.stopwatch.seconds
-        state.active = self._warm_up() if run.warm_up_is_next else self._next_visit(at_once)
+        if run.warm_up_is_next:
+            whole = VisitGeometry(WHOLE, {index: view.full for index, view in run.views.items()})
+            state.active = ActiveVisit(0, VisitKind.COARSE, whole, run.sh_degree, UNLIMITED, whole.views)
+        else:
+            state.active = self._next_visit(at_once)
         state.active.began = began
         state.visit += 1
         state.sh_degree = max(state.sh_degree, state.active.sh_degree)
@@ -103,12 +89,6 @@ class Planner(Visits):
             return (most if limit is None else min(most, limit - deferred)) - gaussians
         return self._config.room(run.count(), gaussians, run.limits.of_block(run.blocks))
 
-    def _warm_up(self) -> ActiveVisit:
-        """The visit in which the coarse model of all blocks is trained."""
-        geometry = VisitGeometry(WHOLE, {index: view.full for index, view in self._run.views.items()})
-        degree = self._run.sh_degree
-        return ActiveVisit(0, VisitKind.COARSE, geometry, degree, UNLIMITED, geometry.views)
-
     def _next_visit(self, at_once: int) -> ActiveVisit:
         while True:
             plan = self._next_plan(at_once)
@@ -119,11 +99,11 @@ class Planner(Visits):
                     return active
 
     def _visit(
-        self, plan: VisitPlan, views: Mapping[int, View], showing: tuple[int, ...]
+        self, plan: schedule.VisitPlan, views: Mapping[int, View], showing: tuple[int, ...]
     ) -> ActiveVisit | None:
-        """The next visit to a block, which is worth training on those of its views that show it; None if
-        those whose turn it is do not see it after all."""
-        state, block, seed = self._state, plan.block, self._config.seed
+        """The next visit to a block, on some of the views that show it; None if those whose turn it is do not
+        see it after all."""
+        state, block, seed = self._run.state, plan.block, self._config.seed
         state.views[block] = len(showing)
         if not showing:
             return None
@@ -132,27 +112,27 @@ class Planner(Visits):
         used, earlier = self._views_used(len(showing)), state.health.get(block, BlockHealth()).visits
         # Where no influence is on record, none is compared with it.
         doubtful = tuple(sorted(views.keys() - set(showing))) if block in state.influence else ()
-        chosen = visit_views(showing, used, earlier, seed)
-        doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
+        chosen = schedule.visit_views(showing, used, earlier, seed)
+        doubted = schedule.visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
         asked = {view: views[view] for view in (*chosen, *doubted)}
         share = self._config.recipe.influence_share
-        found = self._footprints(block, asked, share)
-        chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
+        crops = self._footprints(block, asked, share).crops
+        chosen = tuple(view for view in chosen if view in crops)
+        looked_at = tuple(view for view in doubted if view in crops)[:1]
         if not chosen:
             return None
-        looked_at = doubted[:1]
-        geometry = VisitGeometry(block, {view: found.crops[view] for view in (*chosen, *looked_at)})
+        used_views = (*chosen, *looked_at)
+        geometry = VisitGeometry(block, {view: crops[view] for view in used_views})
         known = state.influence if share < 1 else {}
-        visible = visible_blocks(known, geometry.views, self._scene.tree.num_blocks)
         return ActiveVisit(
             number=state.visit,
             kind=VisitKind.BLOCK,
             geometry=geometry,
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else self._run.sh_degree,
             steps=plan.steps,
-            views=(*chosen, *looked_at),
-            visible=visible,
+            views=used_views,
+            visible=visible_blocks(known, geometry.views, self._scene.tree.num_blocks),
             batch=plan.batch,
             looked_at=looked_at,
             showing=showing,
@@ -162,12 +142,12 @@ class Planner(Visits):
         """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
         block may grow anywhere."""
         run, total = self._run, self._run.budget.steps
-        steps = UNLIMITED if total is None else total - self._state.step
+        steps = UNLIMITED if total is None else total - run.state.step
         geometry = VisitGeometry(block, {view: run.views[view].full for view in showing})
-        return ActiveVisit(self._state.visit, VisitKind.JOINT, geometry, run.sh_degree, steps, geometry.views)
+        return ActiveVisit(run.state.visit, VisitKind.JOINT, geometry, run.sh_degree, steps, geometry.views)
 
-    def _next_plan(self, at_once: int) -> VisitPlan:
-        state = self._state
+    def _next_plan(self, at_once: int) -> schedule.VisitPlan:
+        state = self._run.state
         while not state.queue:
             self._plan_epoch(at_once)
         busy = sorted({visit.geometry.block for visit in state.in_flight})
@@ -179,7 +159,7 @@ class Planner(Visits):
 
     def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
-        recipe, state, blocks = self._config.recipe, self._state, self._scene.tree.num_blocks
+        recipe, state, blocks = self._config.recipe, self._run.state, self._scene.tree.num_blocks
         if not state.views:
             state.views = {block: self._views_showing(block) for block in range(blocks)}
         else:
@@ -191,7 +171,7 @@ class Planner(Visits):
         if not any(state.views.values()):
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
         used = {block: self._views_used(seen) for block, seen in state.views.items()}
-        passes = passes_of_visit(recipe.passes, _typical(used), at_once, blocks)
+        passes = schedule.passes_of_visit(recipe.passes, _typical(used), at_once, blocks)
         if state.epoch % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
@@ -199,23 +179,23 @@ class Planner(Visits):
         remaining = None if total is None else total - state.planned
         batches = {block: self._views_of_step(block) for block in used}
         options = passes, remaining, self._config.seed, recipe.visit_steps, batches
-        state.queue = list(plan_epoch(state.epoch, used, *options))
+        state.queue = list(schedule.plan_epoch(state.epoch, used, *options))
 
     def _views_of_step(self, block: int) -> int:
         """Fewer while the block is under-trained, where its steps are larger for that."""
         config, trained = self._config, None
         if config.recipe.fast_start:
             trained = self._scene.clocks(block).adam_views + config.recipe.trained_before
-        return views_per_step(config.batch, self._scene.tree.num_blocks, trained)
+        return schedule.views_per_step(config.batch, self._scene.tree.num_blocks, trained)
 
     def _views_used(self, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
         limit = self._config.recipe.visit_views
-        return views_per_visit(seen, _typical(self._state.views), limit) if seen else 0
+        return schedule.views_per_visit(seen, _typical(self._run.state.views), limit) if seen else 0
 
     def _views_showing(self, block: int) -> int:
         """As many as are worth training it on, if that is known; a visit looks again."""
-        known = self._known_to_show(block, self._state.influence.get(block, ()))
+        known = self._known_to_show(block, self._run.state.influence.get(block, ()))
         return len(known) or self._views_seeing(block)
 
     def _views_seeing(self, block: int) -> int:
@@ -223,9 +203,8 @@ class Planner(Visits):
         return len(self._sampled(block, views) or self._seeing(block, views))
 
     def _known_to_show(self, block: int, views: Iterable[int]) -> tuple[int, ...]:
-        """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as
-        that is known; empty if it is not."""
-        known, share = self._state.influence.get(block), self._config.recipe.influence_share
+        """The fewest of these views that show nearly all of the block; empty if that is not known."""
+        known, share = self._run.state.influence.get(block), self._config.recipe.influence_share
         if known is None or share >= 1:
             return ()
         return worth_training({view: known[view] for view in views if view in known}, share)

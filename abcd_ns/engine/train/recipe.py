@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Recipe:
-    """What makes a method. The methods of `ns-train` differ in this; its command line does not offer it."""
+    """What the methods of `ns-train` differ in; its command line does not offer it."""
 
     layers: bool = True
     """Composite each block with the frozen blocks around it. Off is the paper's ablation."""

@@ -73,8 +73,7 @@ class TrainingRun:
         if self._reduced[1] is not self.views:
             self._reduced = {1: self.views}
         if reduction not in self._reduced:
-            views = {index: view.reduced(reduction) for index, view in self.views.items()}
-            self._reduced[reduction] = views
+            self._reduced[reduction] = {i: view.reduced(reduction) for i, view in self.views.items()}
         return self._reduced[reduction]
 
     def reach(self, views: Iterable[int]) -> float:

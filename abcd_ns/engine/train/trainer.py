@@ -19,6 +19,13 @@ from abcd_ns.engine.types import View
 class Trainer(ABC):
     """Trains a scene step by step, and tells its listeners what happens."""
 
+    trains_elsewhere: bool = False
+    """Whether steps are taken by others now: then `await_step` stands for a whole step."""
+    layer_limit: int = 0
+    """Bytes that layers may take, on the device and in RAM."""
+    layer_bytes: int = 0
+    """Bytes that layers take."""
+
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
         self.config, self.scene = run.config, run.scene
@@ -53,11 +60,6 @@ class Trainer(ABC):
         """Call when the run is finished: does what comes after the last step, if it was not done."""
 
     # -- elsewhere -----------------------------------------------------------------------------------
-
-    @property
-    def trains_elsewhere(self) -> bool:
-        """Whether steps are taken by others now: then `await_step` stands for all of the above."""
-        return False
 
     def await_step(self) -> None:
         """Return when one more step of the run has been taken elsewhere, or the run is finished."""
@@ -104,16 +106,6 @@ class Trainer(ABC):
     def finished(self) -> bool:
         """Whether the budget is used up."""
         return self.progress >= 1.0
-
-    @property
-    def layer_limit(self) -> int:
-        """Bytes that layers may take, on the device and in RAM."""
-        return 0
-
-    @property
-    def layer_bytes(self) -> int:
-        """Bytes that layers take."""
-        return 0
 
     def count(self) -> int:
         """Gaussians in the whole scene, what is active included."""
