@@ -133,9 +133,9 @@ class Health:
         if count:
             record, active = self._record, self._active
             setattr(record, what, getattr(record, what) + count)
-            alone = active is None or active.is_whole
             number = 0 if active is None else active.number
-            self._announce(Repaired(number, None if alone else active.geometry.block, what, count))
+            block = None if active is None or active.is_whole else active.geometry.block
+            self._announce(Repaired(number, block, what, count))
 
     def look_over(self) -> None:
         """Repair all that is no number in the active block; call before it is persisted."""

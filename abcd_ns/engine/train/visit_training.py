@@ -13,6 +13,7 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
+from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.health import share_of_picture
@@ -20,14 +21,6 @@ from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import (
-    endless_order,
-    exponential_decay,
-    final_decay,
-    view_order,
-    views_per_step,
-    warm_up_is_over,
-)
 from abcd_ns.engine.train.step.active_block import ActiveBlock
 from abcd_ns.engine.train.step.batch import (
     COMING,
@@ -61,9 +54,8 @@ class VisitTraining:
     @property
     def batch(self) -> int:
         """Views in a step of the visit that is under way; the most that one draws where none is."""
-        config = self.run.config
-        most = views_per_step(config.batch, self.run.blocks)
         active = self.run.state.active
+        most = schedule.views_per_step(self.run.config.batch, self.run.blocks)
         return most if active is None else active.batch or most
 
     def attach(self, active: ActiveVisit) -> None:
@@ -73,40 +65,34 @@ class VisitTraining:
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
         self._reach = run.reach(active.trained_on)
         run.scene.set_active(block, self._visits.attached(active, run.params), run.config.sh_degree)
-        gaussians, self.influence = len(self.block), None
+        self.influence = None
         if active.is_whole:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
-        run.announce(VisitBegan(active.number, state.epoch, block, active.steps, seen, gaussians))
+        run.announce(VisitBegan(active.number, state.epoch, block, active.steps, seen, len(self.block)))
         before = run.stopwatch.seconds
         # None where nobody knows how many steps it will have, and its views are drawn in turn.
         taken = 0 if active.is_alone else active.steps * self.batch
-        self._order = view_order(active.views, taken, active.number, run.config.seed)
+        self._order = schedule.view_order(active.views, taken, active.number, run.config.seed)
         self.layers = layers_of_visit(run, self._room, active, self._order[active.done * self.batch :])
         active.layer_seconds += run.stopwatch.seconds - before
-        if active.done == 0 and active.looked_at:
-            state.influence[block].update(self._shown_in(active.looked_at))
-
-    def _shown_in(self, views: Sequence[int]) -> dict[int, float]:
-        """The influence that the block has on each of these views by now."""
-        run, shown, gaussians = self.run, {}, active_gaussians(self.run.params)
-        for view in views:
-            seen, options = self.whole(view), {"antialiased": run.config.antialiased}
-            shown[view] = share_shown(gaussians, run.rasterizer, seen.shot, seen.in_front, **options)
-        return shown
+        for view in active.looked_at if active.done == 0 else ():
+            whole, gaussians = self.whole(view), active_gaussians(run.params)
+            state.influence[block][view] = share_shown(
+                gaussians, run.rasterizer, whole.shot, whole.in_front, antialiased=run.config.antialiased
+            )
 
     # -- a step --------------------------------------------------------------------------------------
 
     def next_batch(self) -> Batch:
-        """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
-        come, too."""
+        """As Trainer.next_batch; listeners are told the views of the steps to come, too."""
         run = self.run
         if run.active.is_alone:
             self.block.raise_degree(self.degree)
-        decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
+        decay = schedule.exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
         decays = run.config.recipe.fast_start and (run.active.is_joint or self.block.clocks.visits > 0)
         trained = self.block.clocks.adam_views + run.config.recipe.trained_before
-        damping = final_decay(run.progress, trained) if decays else 1.0
+        damping = schedule.final_decay(run.progress, trained) if decays else 1.0
         self._pace.set(self.batch, trained, decay, damping)
         first = run.active.done * self.batch
         views = self._views_of(range(first, first + self.batch + COMING))
@@ -123,7 +109,7 @@ class VisitTraining:
         return rendered
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
-        """What a batch adds to the loss of a step: over what of the crops says something about the block."""
+        """As Trainer.loss, over what of the crops says something about the block."""
         pictures, photos = self._visits.compared(batch, pictures, photos)
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         self._rendered = None
@@ -138,8 +124,10 @@ class VisitTraining:
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(errors)
-        seen = rendered.infos, self._residuals.found()
-        clock = self.block.after_step(taken, self.batch, self._visits.room(), *(seen if sound else ((), ())))
+        infos, judged = rendered.infos, self._residuals.found()
+        if not sound:
+            infos, judged = (), ()
+        clock = self.block.after_step(taken, self.batch, self._visits.room(), infos, judged)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.block.prune()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
@@ -160,7 +148,7 @@ class VisitTraining:
         run = self.run
         if run.light is None:
             return
-        damping = exponential_decay(run.progress, LAST_RATE)
+        damping = schedule.exponential_decay(run.progress, LAST_RATE)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
         lights = zip(rendered.views, rendered.lights, strict=True)
         gradients = [(view.index, light.grad) for view, light in lights if light.grad is not None]
@@ -173,7 +161,7 @@ class VisitTraining:
         out_of_time = run.progress >= min(active.until, 1.0)
         if active.is_whole:
             uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
-            out_of_time |= warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
+            out_of_time |= schedule.warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
         return active.done >= active.steps or out_of_time or self.block.has_outgrown
 
     def finish(self) -> BlockState:
@@ -204,7 +192,7 @@ class VisitTraining:
         """What is drawn at these places of the visit; fewer where it ends before."""
         if not self._order:
             views, seed = self.run.active.views, self.run.config.seed
-            return tuple(endless_order(views, place, seed) for place in places)
+            return tuple(schedule.endless_order(views, place, seed) for place in places)
         return self._order[places.start : places.stop]
 
     def _sample(self, view: int, place: int, *, in_part: bool = True) -> Sample:
@@ -232,18 +220,14 @@ class VisitTraining:
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         views = tuple(sample.view for sample in samples)
         lights = tuple(None if run.light is None else run.light.of(view.index) for view in views)
-        return Rendered(self._pictures(samples, rasters, lights), rasters, infos, lights, views)
+        pictures = None
+        if run.light is None:
+            pictures = pictures_of(rasters, [sample.frame(run.density.config.prunes) for sample in samples])
+        if pictures is None:
+            pictures = tuple(map(self._picture, samples, rasters, lights))
+        return Rendered(pictures, rasters, infos, lights, views)
 
-    def _pictures(
-        self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]
-    ) -> tuple[Tensor, ...]:
-        blend_weights = self.run.density.config.prunes
-        if all(light is None for light in lights):
-            found = pictures_of(rasters, [sample.frame(blend_weights) for sample in samples])
-            if found is not None:
-                return found
-        drawn = zip(samples, rasters, lights, strict=True)
-        return tuple(
-            s.picture(with_blend_weights(raster, s.in_front, s.share) if blend_weights else raster, light)
-            for s, raster, light in drawn
-        )
+    def _picture(self, sample: Sample, raster: Raster, light: Tensor | None) -> Tensor:
+        if self.run.density.config.prunes:
+            raster = with_blend_weights(raster, sample.in_front, sample.share)
+        return sample.picture(raster, light)

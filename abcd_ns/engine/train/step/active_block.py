@@ -35,6 +35,7 @@ class ActiveBlock:
         self.clocks = Clocks()
         self.is_new = False
         """Whether deferred points joined it when its visit began: they have had no time to be of use."""
+        self._highest = run.config.sh_degree
         self._held: tuple[Tensor, Tensor] | None = None
         run.optimizers["features_rest"].register_step_pre_hook(self._hold_degrees)
 
@@ -42,12 +43,8 @@ class ActiveBlock:
         return len(self._run.params["means"])
 
     def attach(self, active: ActiveVisit, batch: int, sh_degree: int) -> None:
-        """Make the block of a visit active, as it is stored; an OutOfRoomError if it does not fit.
-
-        Args:
-            batch: views in a step.
-            sh_degree: of its first one. Higher harmonics take no memory, but where the block has some.
-        """
+        """Make the block of a visit active, as it is stored, for steps of `batch` views; an OutOfRoomError if
+        it does not fit. Harmonics above `sh_degree` take no memory, but where the block has some."""
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(rows_for_visit(*which), sh_degree, run.device)
         stored = state_for_visit(*which)
@@ -83,19 +80,15 @@ class ActiveBlock:
         state = detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
         return state.of_degree(self._highest)
 
-    @property
-    def _highest(self) -> int:
-        return self._run.config.sh_degree
-
     def let_go(self) -> None:
         """No block is active any more, and the device has its memory back."""
         run = self._run
-        nobody = BlockState.fresh(Gaussians.empty(run.config.sh_degree, run.device))
+        nobody = BlockState.fresh(Gaussians.empty(self._highest, run.device))
         attach(nobody, run.params, run.optimizers)
         self.growth, self._held = {}, None
 
     def end_visit(self, counts: bool) -> None:
-        """A visit has ended, which may count."""
+        """A visit has ended. Only one that `counts` is counted."""
         self.growth.pop(LARGEST, None)
         self.clocks = replace(self.clocks, visits=self.clocks.visits + counts)
 
