@@ -91,7 +91,7 @@ class ExactTrainer(Trainer):
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels
             samples.append(Sample(view, crop, None, None, behind, share))
-        return Batch(step, tuple(samples))
+        return Batch(tuple(samples))
 
     def render(self, batch: Batch) -> Rendered:
         """Pass 1: all blocks' layers, folded; differentiable in the pictures alone."""

@@ -43,7 +43,7 @@ def test_a_forecast_adds_up():
     low, high = found.hours
     assert low < high == pytest.approx(low * 1000 / 400)
     needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
-    assert sum(found.shares["device"].values()) == needs.bytes_for(250)
+    assert sum(found.shares["device"].values()) == needs.fixed_bytes + 250 * needs.gaussian_bytes
     parameters = 1000 * needs.parameter_bytes  # on disk with both moments, twice, and as a checkpoint
     assert sum(found.shares["disk"].values()) == parameters * (2 * 3 + 1)
     assert not found.warnings

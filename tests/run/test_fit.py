@@ -37,6 +37,11 @@ def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
     return DeviceNeeds(pixels, 1, **options, active_degree=degree)
 
 
+def peak_of(needs: DeviceNeeds, gaussians: int) -> int:
+    """Of a visit to a block, bytes; layers and photos that are kept left out."""
+    return needs.fixed_bytes + gaussians * needs.gaussian_bytes
+
+
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
 @pytest.mark.parametrize("gb", [4, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
@@ -46,7 +51,7 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
         needs = needs_of(fit, PIXELS, blocks)
         left = needs.left(gb * GIB)
         assert left == gb * GIB * (7 if blocks == 1 else 6) // 8
-        assert needs.bytes_for(limit) <= left < needs.bytes_for(limit + 1)
+        assert peak_of(needs, limit) <= left < peak_of(needs, limit + 1)
     assert (fit.blocks == 1) == (gaussians <= FULL * fit.sole)
     if fit.blocks > 1:
         assert gaussians <= fit.blocks * FULL * fit.limit
@@ -69,7 +74,7 @@ def test_large_photos_are_trained_on_by_parts(gb, pixels, whole):
     assert min(fit.limit, fit.sole) > POINTS
     for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
         needs = needs_of(fit, pixels, blocks)
-        assert needs.bytes_for(limit) <= needs.left(int(gb * GIB))
+        assert peak_of(needs, limit) <= needs.left(int(gb * GIB))
     said = fit.in_words()
     assert "\n" not in said
     assert ("parts of" in said) != whole
@@ -94,7 +99,7 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
     assert many.limit < few.limit
     needs = needs_of(many, GARDEN, many.blocks_at_the_end)
     assert needs.drawing_bytes > needs.step_bytes
-    assert needs.bytes_for(many.limit) <= needs.left(12 * GIB)
+    assert peak_of(needs, many.limit) <= needs.left(12 * GIB)
 
 
 @given(side=st.integers(100, 6000), batch=st.integers(1, 4))
@@ -113,7 +118,7 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
     for degree in range(training.growing_degree + 1, 4):
         few = limits_at(training, degree).of_block(blocks)
         needs = dataclasses.replace(growing, active_degree=degree)
-        assert needs.bytes_for(few) <= growing.bytes_for(most) < needs.bytes_for(few + 2)
+        assert peak_of(needs, few) <= peak_of(growing, most) < peak_of(needs, few + 2)
         assert degree_with_room(training, int(FULL * few), blocks) == degree
         assert degree_with_room(training, int(FULL * few) + 1, blocks) == degree - 1
 
@@ -132,7 +137,7 @@ def test_a_cpu_keeps_layers_and_photos_under_another_budget():
     needs = dataclasses.replace(needs_of(cpu, PIXELS, cpu.blocks_at_the_end), keeps=False)
     assert needs.left(8 * GIB) == 8 * GIB
     assert (needs.layer_bytes(8 * GIB), needs.photo_bytes(8 * GIB)) == (0, 0)
-    assert needs.bytes_for(cpu.limit) <= 8 * GIB < needs.bytes_for(cpu.limit + 1)
+    assert peak_of(needs, cpu.limit) <= 8 * GIB < peak_of(needs, cpu.limit + 1)
     assert cpu.limit > device.limit
 
 
@@ -156,7 +161,7 @@ def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
 def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixels):
     size = coarse_model_size(TRAINING, block, pixels)
     visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))  # forced blocks: all at once
-    assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
+    assert peak_of(warm_up, size) <= peak_of(visit, block) < peak_of(warm_up, size + 1)
     assert size > block
 
 

@@ -1,8 +1,7 @@
 """Notices what goes wrong in the active block, counts it, and repairs what can be repaired.
 
-In any run: gradients, moments and values that are no numbers (in exact joint training gradients alone). Where
-blocks are trained within layers: oversized Gaussians. A run in which nothing goes wrong is the same with or
-without all this, on a CPU bit for bit: healthy tensors are read, never written.
+That is gradients, moments and values that are no numbers; in exact joint training gradients alone. Where
+blocks are trained within layers it is oversized Gaussians, too. Healthy tensors are read, never written.
 """
 
 import math
@@ -43,10 +42,8 @@ DISTANCES_AT_ONCE = 1 << 22
 
 
 class Health:
-    """Watches the active block of a coordinator; shrinks oversized Gaussians only if it `may_act`.
-
-    Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
-    """
+    """Watches the active block, through hooks in the optimizers; deals with oversized Gaussians only if it
+    `may_act`."""
 
     def __init__(
         self, scene: VisitScene, params: Params, optimizers: Optimizers, announce: Announcer, *, may_act: bool
@@ -66,23 +63,23 @@ class Health:
             optimizer.register_step_pre_hook(self._clean_gradients)
 
     def begin_visit(self, active: ActiveVisit, health_by_block: HealthByBlock) -> None:
-        """A block was attached; what is found is written to the run's `health_by_block`."""
+        """A block was attached; what is found is added to the run's `health_by_block`."""
         self._active, self._health_by_block = active, health_by_block
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
         self._clean, self._psnr = LATE_AFTER, math.nan
 
-    def see(self, share: Float[Tensor, ""]) -> None:
-        """Take note of how large a part of a picture the active block was, while none has shown it."""
-        self._shares.append(share)
+    @torch.no_grad()
+    def see(self, in_front: Float[Tensor, "h w"] | None, own: Float[Tensor, "h w"]) -> None:
+        """Note how large a part of a picture the active block can be, while none has shown it: by the
+        transmittance of what lies before it, if anything, and its own, with what was sorted in."""
+        alpha = 1 - own
+        self._shares.append((alpha if in_front is None else in_front * alpha).mean())
 
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped, with the mean squared error of each picture that the step drew.
-
-        Returns:
-            Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
-            accelerator of the step before, NaN in a visit's first.
-        """
+        Gives whether its gradients were all numbers, as far as known, and the mean PSNR, dB: on an
+        accelerator of the step before, NaN in a visit's first."""
         self._send(errors)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
@@ -97,8 +94,8 @@ class Health:
     def shrink_oversized(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> None:
         """Shrink Gaussians, but for the spared, that are too large for every camera, along the axes that are.
 
-        Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
-        mean: from anywhere else it may come before what it lies behind, and veil half the picture.
+        Photos may agree on such a Gaussian. But it is sorted by its mean: from anywhere else it may come
+        before what it lies behind, and veil half the picture.
         """
         if not self.may_act:
             return
@@ -114,8 +111,8 @@ class Health:
 
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Logarithms of standard deviations that none but the spared may grow beyond, lest it be oversized. A
-        value that is no number bounds nothing."""
+        """Logarithms of standard deviations that none but the spared may grow beyond. A value that is no
+        number bounds nothing."""
         scales = self._params["scales"]
         _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
         return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
@@ -129,7 +126,7 @@ class Health:
         self._active = self._attached = None
 
     def count(self, what: str, count: int) -> None:
-        """So much of the active block had to be repaired; see BlockHealth for what."""
+        """So much of the active block had to be repaired; `what` is a field of BlockHealth."""
         if count:
             record, active = self._record, self._active
             setattr(record, what, getattr(record, what) + count)
@@ -233,8 +230,8 @@ class Health:
 class StepGuard:
     """Has an accelerator skip a step whose gradients are no numbers, while the host knows of nothing.
 
-    It tells fused Adams by `found_inf`, as a GradScaler does; they step one after the other, in any order.
-    Those that are `Adam` share one step count, which is advanced here: one kernel for all of them.
+    It tells fused Adams by `found_inf`, as a GradScaler does. Those that are `Adam` share one step count,
+    which is advanced here: one kernel for all of them.
     """
 
     def __init__(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
@@ -250,8 +247,8 @@ class StepGuard:
         return all(optimizer.defaults.get("fused") for optimizer in self._optimizers.values())
 
     def record(self, optimizer: torch.optim.Optimizer, skips: bool) -> None:
-        """Call before it steps; with `skips` they do nothing if a gradient is no number. The gradients of all
-        are looked at when the first of them does."""
+        """Call before it steps; with `skips` it does nothing if a gradient is no number. Those of all
+        optimizers are looked at before the first one steps."""
         if not self._told or any(told is optimizer for told in self._told):
             self._told, self._found = [], self._begin(skips)
         self._told.append(optimizer)
@@ -304,8 +301,8 @@ def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
 def wider_than(
     angle: float, scales: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], views: Iterable[View]
 ) -> tuple[Bool[Tensor, "n 3"], Float[Tensor, "n 1"]]:
-    """Along which axes a standard deviation, of which `scales` are logarithms, is over this share of the
-    distance to the nearest camera, and the logarithm of what would not be."""
+    """Along which axes a standard deviation, of which `scales` are logarithms, is over `angle` times the
+    distance to the nearest camera, and the logarithm of that."""
     views = tuple(views)
     near = torch.tensor([[view.near] for view in views], dtype=torch.float64)
     cameras = upload(torch.cat((centers_of(views), near), dim=1).to(means.dtype), means.device)
@@ -323,21 +320,11 @@ def _distances(ours: Float[Tensor, "n 3"], theirs: Float[Tensor, "m 3"]) -> Floa
     return torch.linalg.vector_norm(ours[:, None] - theirs, dim=-1)
 
 
-@torch.no_grad()
-def share_of_picture(in_front: Float[Tensor, "h w"] | None, own: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """How large a part of a picture a block can be, 0..1, by the transmittance of what lies before it, if
-    anything, and its own, with what was sorted in."""
-    alpha = 1 - own
-    return (alpha if in_front is None else in_front * alpha).mean()
-
-
 def stand_ins(sound: Gaussians, count: int) -> Gaussians:
     """`count` Gaussians amid the `sound` ones, as large as they usually are, and too faint to be drawn."""
-    known = len(sound) > 0
     values = {name: value.new_zeros((count, *value.shape[1:])) for name, value in sound.items()}
-    for name in ("means", "scales"):
-        if known:
-            values[name] += getattr(sound, name).median(dim=0).values
+    for name in ("means", "scales") if len(sound) else ():
+        values[name] += getattr(sound, name).median(dim=0).values
     values["quats"][:, 0] = 1.0
     values["opacities"] += STAND_IN_OPACITY
     return Gaussians(**values)

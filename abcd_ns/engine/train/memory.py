@@ -1,8 +1,7 @@
 """How many Gaussians fit on the device: a model to plan with, and a look before memory is taken.
 
-The model adds up what a visit must hold, part by part, and rounds up. `tests/simulated/test_memory.py`
-holds it against live tensors, by pixel and by Gaussian, and `abcd compare --tiles` measures what a run
-takes; what a GPU took is in docs/results/gpu.
+The model adds up what a visit must hold, and rounds up. `tests/simulated/test_memory.py` compares it with
+live tensors, `abcd compare --tiles` with what a run takes; what a GPU took is in docs/results/gpu.
 """
 
 import math
@@ -75,7 +74,7 @@ class DeviceNeeds:
     @property
     def gaussian_bytes(self) -> int:
         """Of one Gaussian in training: parameters, gradient, two moments, and what its views' drawings hold.
-        Refining takes no more: gradients are gone by then, and one tensor is replaced after the other."""
+        Refining takes no more: gradients are gone by then."""
         drawn = self.batch * projected_bytes(self.primitive) + self.waiting * KEPT_FLOATS * FLOAT
         return 4 * self.parameter_bytes + drawn
 
@@ -88,12 +87,9 @@ class DeviceNeeds:
     @property
     def drawing_bytes(self) -> int:
         """Of whole views while F and B are drawn, which is before the first step: layers while they are
-        folded, views that are being drawn, and the least pass of frozen Gaussians. For a larger one see
-        `frozen_beside`."""
-        if self.levels == 0:
-            return 0
+        folded, views that are being drawn, and the least pass of frozen Gaussians."""
         parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
-        return parts + self._drawn_bytes
+        return parts + self._drawn_bytes if self.levels else 0
 
     @property
     def _drawn_bytes(self) -> int:
@@ -102,8 +98,8 @@ class DeviceNeeds:
         return pixels + LEAST_PASS * frozen + DEVICE_SPLATS * drawn
 
     def frozen_beside(self, active: int) -> int:
-        """Frozen Gaussians that a pass may draw beside so many active ones. Their room is what these have for
-        gradients and for their own drawings, which have not begun."""
+        """Frozen Gaussians that a pass may draw beside so many active ones, whose gradients and drawings have
+        not begun."""
         free = active * (self.gaussian_bytes - 3 * self.parameter_bytes)
         return free // drawing_bytes(self.sh_degree, self.primitive)
 
@@ -116,10 +112,6 @@ class DeviceNeeds:
     def fixed_bytes(self) -> int:
         """Whatever the block: what is held in a step or while layers are drawn."""
         return max(self.step_bytes, self.drawing_bytes)
-
-    def bytes_for(self, gaussians: int) -> int:
-        """The peak of a visit to a block of so many Gaussians, layers and photos that are kept left out."""
-        return self.fixed_bytes + gaussians * self.gaussian_bytes
 
     def layer_bytes(self, budget: int) -> int:
         """What of `budget` bytes is for the layers of a visit."""
@@ -180,8 +172,8 @@ def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
 
 
 def degree_with_room(config: TrainingConfig, largest: int, blocks: int) -> int:
-    """The highest degree of harmonics for which the largest of so many blocks, of `largest` Gaussians, has
-    room."""
+    """The highest degree of harmonics for which there is room in the largest of so many blocks, which has
+    `largest` Gaussians."""
     least = config.growing_degree
     degrees = range(config.sh_degree, least, -1)
     return next((d for d in degrees if largest <= FULL * limits_at(config, d).of_block(blocks)), least)
@@ -207,8 +199,7 @@ def projected_bytes(primitive: PrimitiveName) -> int:
 
 
 def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
-    """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
-    wants them, and rows of one view, some of them twice."""
+    """What a Gaussian takes while it is drawn without gradients: its parameters and rows of one view, twice."""
     return 2 * parameter_bytes(sh_degree) + 2 * PRIMITIVES[primitive].rows * FLOAT
 
 
@@ -221,8 +212,8 @@ def free_bytes(device: torch.device) -> int:
 
 
 def free_on_gpu(device: torch.device) -> int:
-    """What a GPU has left, whatever uses the rest; torch 2.4 wants to know which, where that goes without
-    saying."""
+    """What a GPU has left, whatever uses the rest."""
+    # torch 2.4 takes no device without a number.
     number = torch.cuda.current_device() if device.index is None else device.index
     return torch.cuda.mem_get_info(number)[0]
 

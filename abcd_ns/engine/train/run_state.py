@@ -1,4 +1,4 @@
-"""Where a run stands: integers and plans, in JSON, so that a run can stop anywhere and go on exactly."""
+"""Where a run stands, in JSON, so that it can stop anywhere and resume exactly."""
 
 import copy
 import time
@@ -63,13 +63,13 @@ class ActiveVisit:
     """In use from the visit's first step to its last, so that its layers stay right."""
     steps: int
     views: tuple[int, ...]
-    """Indices of the views in use, of those that see the block."""
+    """Indices of the views in use."""
     showing: tuple[int, ...] = ()
     """Those that are worth training the block on, of which each visit uses some; empty where all are used."""
     visible: dict[int, tuple[int, ...]] = field(default_factory=dict)
     """By view, the blocks that its layers show, see `influence.visible_blocks`; missing views show all."""
     looked_at: tuple[int, ...] = ()
-    """Those in use that hardly show the block, as far as known: to see whether they still do not."""
+    """Those in use that hardly showed the block when last looked at."""
     done: int = 0
     saved: bool = False
     """Whether the active block was persisted in the middle of the visit, see special_blocks.ACTIVE."""
@@ -98,17 +98,17 @@ class ActiveVisit:
 
     @property
     def is_whole(self) -> bool:
-        """Whether this is the warm-up, in which the coarse model of all blocks is trained at once."""
+        """Whether this is the warm-up."""
         return self.kind is VisitKind.COARSE
 
     @property
     def is_all(self) -> bool:
-        """Whether all that there is of the scene by now is in training."""
+        """Whether the whole scene is in training."""
         return self.is_whole or self.is_joint
 
     @property
     def is_alone(self) -> bool:
-        """Whether what is trained has nothing around it, and nobody knows how many steps it will have."""
+        """Whether nothing lies around what is trained; the number of steps is not known then."""
         return self.kind is not VisitKind.BLOCK
 
     def share(self, progress: float) -> float:

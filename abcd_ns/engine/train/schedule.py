@@ -1,8 +1,7 @@
 """Which block next, for how many steps, on which views: pure functions of integers.
 
-There is one step budget for the whole scene. An epoch visits every block that some view sees; what its
-steps draw is proportional to the number of those views, as in joint training: blocks that few see
-overfit otherwise.
+One step budget serves the whole scene. What an epoch's steps draw of a block is proportional to the views
+that see it, as in joint training: blocks that few see overfit otherwise.
 """
 
 import math
@@ -17,22 +16,20 @@ T = TypeVar("T")
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks, of one that was trained on many views."""
 UNDER_TRAINED = 500
-"""Views that a block was trained on, the warm-up's included, below which its steps draw one; two below twice
-as many, and so on. Its steps are as large whatever they draw, see `rates_of_under_trained`."""
+"""Views that a block was trained on, warm-up included, below which its steps draw one; two below twice as
+many, and so on. Its steps are as large whatever they draw, see `rates_of_under_trained`."""
 COARSE_MODEL_PASSES, WARM_UP_PASSES, LONGER = 24, 32, 2.4
-"""Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
-soon are as good as they can be; elsewhere at least, but no longer than so many times its share of the run. A
-run that cannot often show all views to the whole scene can do so even less to each block."""
+"""Uses of each view in the warm-up: the first at most, where not all Gaussians have room; elsewhere the second
+at least, but no longer than so many times its share of the run."""
 LEAST_SIDE = 100
-"""Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
+"""Of a reduced picture, pixels, at least."""
 FEW_VIEWS = 32
-"""Of a visit: with more, a visit uses each less often, and is as long."""
+"""With more, a visit uses each less often, and is as long."""
 SHORTER = 4
-"""Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
-others have made of themselves meanwhile."""
+"""Visits are so many times shorter where all blocks are trained at once."""
 DECAY_BEGINS, DECAYED_TO, DECAY_VIEWS = 0.6, 0.1, 1000
-"""From this share of a run on learning rates fall, to this share of them where a block was trained on so many
-views, the warm-up's included: one that saw fewer is on its way yet."""
+"""From this share of a run on learning rates fall, to this share of them for a block that was trained on so
+many views, warm-up included, and less for one that saw fewer."""
 
 
 class VisitPlan(NamedTuple):
@@ -45,16 +42,16 @@ class VisitPlan(NamedTuple):
 
 
 def warm_up_is_over(progress: float, uses: float, share: float, deferred: int) -> bool:
-    """Whether the coarse model has been trained for long enough, by uses of each view so far, where `share`
-    of the run is the warm-up's and the coarse model has no room for so many Gaussians."""
+    """Whether the warm-up, with `share` of the run, has used each view often enough; the coarse model has no
+    room for the `deferred` Gaussians."""
     if deferred:
         return progress >= share or uses >= COARSE_MODEL_PASSES
     return progress >= share and (uses >= WARM_UP_PASSES or progress >= LONGER * share)
 
 
 def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
-    """How often a visit uses each view: `passes` times, where it is alone, and that to the median block has
-    FEW_VIEWS or fewer. Visits that are in flight at once are shorter, by the share of other blocks."""
+    """How often a visit uses each view: `passes` times, where it is alone and that to the median block uses
+    FEW_VIEWS or fewer. Visits in flight at once are shorter, by the share of other blocks."""
     alone = math.ceil(passes * min(1.0, FEW_VIEWS / max(used, 1)))
     unseen = min((at_once - 1) / max(blocks - 1, 1), 1.0)
     return alone / (1 + (SHORTER - 1) * unseen)
@@ -109,15 +106,14 @@ def evenly(values: Sequence[T], wanted: int) -> list[T]:
 
 
 def views_per_visit(seen: int, typical: int, limit: int) -> int:
-    """How many of the `seen` views of a block a visit uses: the same share of every block's, so that what
-    steps draw stays in proportion, and `limit` for a block that as many views see as the median one,
-    `typical`. It draws F and B for each: it uses twice the limit at most."""
+    """How many of the `seen` views of a block a visit uses: the same share of every block's, `limit` for the
+    median block, which `typical` views see, and twice the limit at most."""
     share = -(-seen * min(limit, typical) // typical)  # rounded up
     return min(seen, share, 2 * limit)
 
 
 def visit_views(views: tuple[int, ...], count: int, visits: int, seed: int) -> tuple[int, ...]:
-    """The views of a block's visit after `visits` earlier ones: in turn, all are used equally often."""
+    """The `count` views of a block's visit after `visits` earlier ones: all are used equally often."""
     places = range(visits * count, (visits + 1) * count)
     return tuple(dict.fromkeys(_in_turn(views, place, f"cycle {seed}") for place in places))
 
@@ -134,7 +130,7 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tup
 
 
 def endless_order(views: tuple[int, ...], index: int, seed: int) -> int:
-    """The view of step `index` where nobody knows how many there will be: shuffled passes over all views."""
+    """The view of step `index` where the number of steps is not known: shuffled passes over all views."""
     return _in_turn(views, index, f"scaffold {seed}")
 
 
@@ -163,8 +159,8 @@ def final_decay(progress: float, views: int) -> float:
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:
-    """By how much pictures are reduced: to a quarter, then to a half of their width, and after the share
-    `coarse` of the run not at all; `shortest` is the least side of any, pixels."""
+    """By how much pictures are reduced: to a quarter, then to half their width, and after the share `coarse`
+    of the run not at all; `shortest` is the least side of any, pixels."""
     wanted = 4 if progress < coarse / 2 else 2 if progress < coarse else 1
     return max(by for by in (1, 2, 4) if by == 1 or (by <= wanted and shortest // by >= LEAST_SIDE))
 

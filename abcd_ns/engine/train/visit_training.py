@@ -1,4 +1,4 @@
-"""The training of one visit's block, from its first step to its last: in whichever process has the block."""
+"""The training of one visit's block, in whichever process has the block."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,6 @@ from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
-from abcd_ns.engine.train.health import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
@@ -35,8 +34,7 @@ from abcd_ns.engine.train.step.batch import (
 
 
 class VisitTraining:
-    """Attaches a block between its layers, takes its steps on the terms of `visits`, and gives back what they
-    made of it."""
+    """Attaches a block between its layers, takes its steps, and gives back what they made of it."""
 
     def __init__(self, run: TrainingRun, visits: Visits, room: LayerRoom) -> None:
         self.run, self._visits, self._room = run, visits, room
@@ -98,14 +96,14 @@ class VisitTraining:
         views = self._views_of(range(first, first + self.batch + COMING))
         run.announce(PhotosWanted(views))
         samples = tuple(self._sample(view, place) for place, view in enumerate(views[: self.batch]))
-        return Batch(run.state.step, samples, run.config.limits.batch_limit)
+        return Batch(samples, run.config.limits.batch_limit)
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in its parameters."""
         rendered = self._rendered = self._draw(batch.samples)
         if not self.run.active.shown:
             for sample, raster in zip(batch.samples, rendered.rasters, strict=True):
-                self.run.health.see(share_of_picture(sample.in_front, raster.transmittance))
+                self.run.health.see(sample.in_front, raster.transmittance)
         return rendered
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
@@ -133,16 +131,15 @@ class VisitTraining:
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
-        """Views of several sizes may have another order in the infos, and of those that are drawn in part
-        only a part is told: they are drawn again afterwards."""
-        if self.influence is None or len(rendered.infos) != 1 or "weights" not in rendered.infos[0]:
-            return
+        """Views of several sizes may have another order in the infos, and views that are drawn in part tell
+        only of that: these are drawn again afterwards."""
         most = self.run.config.limits.crop_pixels
-        if most and any(view.full.pixels > most for view in rendered.views):
+        in_part = most and any(view.full.pixels > most for view in rendered.views)
+        if self.influence is None or in_part or len(rendered.infos) != 1:
             return
-        weights = rendered.infos[0]["weights"].grad
-        if weights is not None:
-            self.influence.note(self.run.params["means"], rendered.views, weights)
+        weights = rendered.infos[0].get("weights")
+        if weights is not None and weights.grad is not None:
+            self.influence.note(self.run.params["means"], rendered.views, weights.grad)
 
     def _adapt_light(self, rendered: Rendered) -> None:
         run = self.run
@@ -162,7 +159,11 @@ class VisitTraining:
         if active.is_whole:
             uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
             out_of_time |= schedule.warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
-        return active.done >= active.steps or out_of_time or self.block.has_outgrown
+        clocks = self.block.clocks
+        outgrown = (
+            active.is_joint and clocks.refined == clocks.steps and run.limits.is_full(len(self.block), 1)
+        )
+        return active.done >= active.steps or out_of_time or outgrown
 
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
@@ -189,7 +190,7 @@ class VisitTraining:
         return self.run.sh_degree if changes else active.sh_degree
 
     def _views_of(self, places: range) -> tuple[int, ...]:
-        """What is drawn at these places of the visit; fewer where it ends before."""
+        """The views at these places of the visit; fewer where it ends before."""
         if not self._order:
             views, seed = self.run.active.views, self.run.config.seed
             return tuple(schedule.endless_order(views, place, seed) for place in places)

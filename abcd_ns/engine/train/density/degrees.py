@@ -1,10 +1,10 @@
 """Degrees: a Gaussian has no more spherical harmonics than show in its views.
 
 45 of its 59 numbers say how its colour changes with the direction that it is seen from. Cameras see it from
-few directions, often from a narrow cone of them, in which fewer harmonics tell nearly as much. What their
-lack changes in the pictures is the Gaussian's weight, known from pruning, times the mean square, over its
-views, by which its colour changes once the lower harmonics are fitted to the higher ones. Of all degrees that
-one is taken for which this and the cost of the numbers are least together; those above do not come back.
+few directions, in which fewer harmonics tell nearly as much. What their lack changes in the pictures is the
+Gaussian's weight, known from pruning, times the mean square, over its views, by which its colour changes once
+the lower harmonics are fitted to the higher ones. The degree is taken for which this and the cost of the
+numbers are least together; those above do not come back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,10 +38,6 @@ AT_ONCE, OF_EACH = 1 << 22, 32
 where that is more, half of what gradients take. However large a block is, an accelerator has few parts."""
 
 
-_Cameras = tuple[Float[Tensor, "v 4 4"], Float[Tensor, "v 3 3"], Float[Tensor, "v 3"]]
-"""World-to-camera matrices and intrinsics of views; width and height, px, and the near plane."""
-
-
 class Lowered(NamedTuple):
     """What Gaussians become."""
 
@@ -62,8 +58,7 @@ def are_gone(
 def lower(
     params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
-    """Let harmonics of the active block go that do not pay, with their moments; see `lowered`. Gives the
-    block's statistics from now on."""
+    """Let harmonics of the active block go that do not pay, see `lowered`; gives its statistics afterwards."""
     if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
@@ -84,7 +79,8 @@ def lowered(
     weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
     chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
-    cameras = _beside(gaussians.means, chosen)
+    numbers = torch.stack([_numbers(view) for view in chosen]).to(gaussians.means.dtype)
+    cameras = upload(numbers, gaussians.means.device)
     coefficients = gaussians.features_rest.shape[1] + 1
     room = max(AT_ONCE, OF_EACH * len(gaussians))
     step = max(room // (coefficients * max(len(chosen), coefficients)), 1)
@@ -93,22 +89,17 @@ def lowered(
     return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
 
 
-def _beside(means: Tensor, views: Sequence[View]) -> _Cameras:
-    """On the device of the Gaussians, in one copy."""
-    rows = []
-    for view in views:
-        ends = view.K.new_tensor([view.width, view.height, view.near])
-        rows.append(torch.cat((view.viewmat.flatten(), view.K.flatten(), ends)))
-    numbers = upload(torch.stack(rows).to(means.dtype), means.device)
-    viewmats, intrinsics, ends = numbers.split((16, 9, 3), dim=1)
-    return viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3), ends
+def _numbers(view: View) -> Float[Tensor, "28"]:
+    """World-to-camera matrix and intrinsics, row by row; width and height, px; the near plane."""
+    ends = view.K.new_tensor([view.width, view.height, view.near])
+    return torch.cat((view.viewmat.flatten(), view.K.flatten(), ends))
 
 
 def _lowered(
     gaussians: Gaussians,
     weight: Float[Tensor, "n"],
     gone: Float[Tensor, "n"],
-    cameras: _Cameras,
+    cameras: Float[Tensor, "v 28"],
     highest: int,
 ) -> Lowered:
     """As `lowered`, at once; a weight, pixels in all views, is NaN for one that is not judged."""
@@ -139,10 +130,11 @@ def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: 
     return torch.cat((values[:, :kept] + more, torch.zeros_like(values[:, kept:])), dim=1)
 
 
-def _gram(gaussians: Gaussians, cameras: _Cameras, bases: int) -> Float[Tensor, "n b b"]:
+def _gram(gaussians: Gaussians, cameras: Float[Tensor, "v 28"], bases: int) -> Float[Tensor, "n b b"]:
     """Mean products of the harmonics in the directions of views. Each counts as it shows a Gaussian: by the
     square of its size there, and not at all where it is beside the picture. NaN where none shows it."""
-    means, (viewmats, intrinsics, ends) = gaussians.means, cameras
+    means, (viewmats, intrinsics, ends) = gaussians.means, cameras.split((16, 9, 3), dim=1)
+    viewmats, intrinsics = viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3)
     turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
     # Matrices of Gaussians by views, for each axis.
     x, y, z = (means @ turn.T + shift for turn, shift in zip(turns.unbind(1), shifts.unbind(1), strict=True))

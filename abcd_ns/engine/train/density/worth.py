@@ -5,8 +5,8 @@ there, d a pixel's offset from the middle, w = alpha T the weight in it and r = 
 differ by h change the picture by h phi, with phi = w (Q s . d). Over some views let b be the sum of phi r, by
 channel, and A that of phi^2: then h = b / A removes b^2 / A of squared error.
 
-That is what these views ask for; others may not. So views are in two halves: h is found by one and tried on
-the other, 2 h b - h^2 A, and the other way round. What only some views ask for is worth less than nothing.
+Views are in two halves: h is found by one and tried on the other, 2 h b - h^2 A, and the other way round. So
+what only some views ask for is worth less than nothing.
 """
 
 import math
@@ -47,8 +47,7 @@ class Judged:
 
 
 def half_of(view: int) -> int:
-    """The half that a view is in, by the sequence of Thue and Morse: of three in a row never all are in one,
-    and it is in step with no rig of cameras."""
+    """The half that a view is in, by the sequence of Thue and Morse, which is in step with no camera rig."""
     return view.bit_count() & 1
 
 
@@ -61,22 +60,16 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
     table, start = growth[WORTH], (BY_CHANNEL + BY_AXIS) * half_of(view.index)
     camera = torch.cat((view.viewmat[:3].flatten(), view.K.diagonal()[:2])).detach().to(means.dtype)
     if suits(means, table, picture.sums):
-        _add_natively(table, start, gaussians, axes, picture, camera)
+        camera = torch.cat((camera, camera.new_full((1,), view.near)))
+        given = means, gaussians.scales, gaussians.quats, picture.sums, camera
+        given = [each.contiguous() for each in given]  # held while their addresses are in use
+        into = address(table)
+        library().abcd_worth(len(table), *map(address, given), axes, picture.share, into, COLUMNS, start)
     else:
         table[:, start : start + BY_CHANNEL + BY_AXIS] += _asked(gaussians, axes, picture, camera)
     table[:, -3] += picture.sums[:, 0] > 0
     table[:, -2] += picture.error.to(means).nan_to_num(0.0, 0.0, 0.0)
     table[:, -1] += 1
-
-
-def _add_natively(
-    table: Tensor, start: int, gaussians: Gaussians, axes: int, picture: Judged, camera: Float[Tensor, "14"]
-) -> None:
-    near = camera.new_full((1,), picture.view.near)
-    given = (gaussians.means, gaussians.scales, gaussians.quats, picture.sums, torch.cat((camera, near)))
-    given = [each.contiguous() for each in given]
-    pointers, into = map(address, given), address(table)
-    library().abcd_worth(len(table), *pointers, axes, picture.share, into, COLUMNS, start)
 
 
 def _asked(
@@ -114,8 +107,8 @@ def share_seen(growth: Mapping[str, Tensor]) -> float:
 def worth(
     growth: Mapping[str, Tensor], views: int, pixels: float
 ) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
-    """Squared error that the best split of each would remove in all of the block's views, by WORTH, and the
-    axis to split along; 0 where that is no more than so many average pixels have."""
+    """Squared error that the best split of each would remove in all of the block's views, and the axis to
+    split along; 0 where that is no more than so many average pixels have."""
     *halves, _, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1, 1), dim=1)
     sums = [(halves[k].view(-1, BY_AXIS, 3), halves[k + 1][..., None]) for k in (0, 2)]
     gain = torch.zeros_like(sums[0][0])

@@ -98,8 +98,7 @@ class ActiveBlock:
         """The optimizers have stepped: grow and prune, where it is time for that.
 
         Args:
-            taken: views that the step drew.
-            batch: views that it was made for.
+            taken: views that the step drew, of the `batch` that it was made for.
             room: Gaussians that may be added.
             infos, judged: see DensityControl.after_step; none where gradients were no numbers.
         """
@@ -108,8 +107,9 @@ class ActiveBlock:
         clock = self.density_clock(taken, batch, room)
         for parameter in run.params.values():  # their memory is for what growth takes
             parameter.grad = None
-        given = run.params, run.optimizers, self.growth
-        self.growth, refined = run.density.after_step(*given, infos, judged, clock)
+        self.growth, refined = run.density.after_step(
+            run.params, run.optimizers, self.growth, infos, judged, clock
+        )
         if refined:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.growth.pop(LARGEST, None)
@@ -118,8 +118,8 @@ class ActiveBlock:
 
     @torch.no_grad()
     def _hold_sizes(self) -> None:
-        """Nothing becomes oversized but what fills much of the block's views, as a plain background may.
-        What is so already stays: no step has seen pictures without it."""
+        """Nothing becomes oversized but what fills much of the block's views. What is so already stays: no
+        step has seen pictures without it."""
         run = self._run
         if not run.health.may_act:
             return
@@ -137,8 +137,8 @@ class ActiveBlock:
         return contributions(self.growth) > FILLS * pixels
 
     def prune(self) -> None:
-        """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
-        change too little. What is seen from now on soon counts for more."""
+        """Take out Gaussians that fill too little of the block's views, and harmonics that change too little.
+        What is seen from now on soon counts for more."""
         run, before, found = self._run, len(self), 0.0
         if before and run.density.config.prunes and run.share >= run.config.density.refine_stop:
             active = active_gaussians(run.params).detach()
@@ -179,9 +179,3 @@ class ActiveBlock:
             first=among_others and self.clocks.visits == 0,
             spent=active.done / active.steps if among_others else 0.0,
         )
-
-    @property
-    def has_outgrown(self) -> bool:
-        """Whether the one block of the scene has just grown to where it must be cut."""
-        grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
-        return grown and self._run.limits.is_full(len(self), blocks=1)

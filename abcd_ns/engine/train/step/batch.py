@@ -30,9 +30,9 @@ Pictures = Sequence[Float[Tensor, "_h _w 3"]]
 KEPT = ("weights", "sums")
 """Of what a drawing tells, what is read after the step."""
 BACKGROUNDS = 1024
-"""Steps whose backgrounds are copied to a device together."""
+"""Steps whose backgrounds a device gets in one copy."""
 COMING = 8
-"""So many views of the next steps are told of ahead, for their photos."""
+"""Views of the next steps whose photos are announced ahead."""
 ALIGN = 16
 """Parts meet at multiples of this in the image, pixels: gsplat's tiles are whole then."""
 PLAY = 64
@@ -94,15 +94,14 @@ class Sample:
         return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
 
     def frame(self, blend_weights: bool) -> Frame:
-        """What the rasterizer's drawing is shown in; with `blend_weights` as in `with_blend_weights`."""
+        """What the drawing is shown in, see `picture`; for `blend_weights` see `with_blend_weights`."""
         front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
         return Frame(front, back, self.background, blend_weights / self.share)
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
     ) -> Float[Tensor, ""]:
-        """Photometric, as this crop's part of the loss of the whole image; where it was drawn by lot, so that
-        the expectation is the part of all that might have been (see `random_part`)."""
+        """Photometric, as this crop's part of the loss of the whole image; for `share` see `random_part`."""
         found = photometric_loss(
             picture,
             photo,
@@ -130,15 +129,14 @@ def _mean_of_squares(pixels: Float[Tensor, "_h _w c"], by: int) -> Float[Tensor,
 class Batch:
     """What one step trains on."""
 
-    step: int
     samples: tuple[Sample, ...]
     at_once: int = 0
-    """Of the samples, so many are drawn at once at most; 0 is no limit."""
+    """Samples that are drawn at once, at most; 0 is no limit."""
     share: float = 1.0
-    """What it counts for in the step, where it is a part of the step's batch."""
+    """What a part of a step's batch counts for in the step."""
 
     def parts(self) -> Iterator["Batch"]:
-        """What is drawn one after the other, backward included, so that less memory holds it."""
+        """What is drawn one after the other, backward included, so that less memory is needed."""
         every = self.at_once or len(self.samples)
         for first in range(0, len(self.samples), every):
             few = self.samples[first : first + every]
@@ -162,9 +160,8 @@ class Rendered:
     """Of the active block and what was sorted in with it."""
     infos: tuple[dict[str, Any], ...]
     lights: Sequence[Tensor | None] = ()
-    """Transforms of the photos' light that the pictures were drawn in."""
+    """Each picture's transform, see Light."""
     views: Sequence[View] = ()
-    """That the pictures are of."""
 
     @property
     def kept(self) -> "Rendered":
@@ -189,7 +186,7 @@ class Residuals:
     def ask(
         self, rendered: Rendered, samples: Sequence[Sample], pictures: Pictures, photos: Pictures
     ) -> None:
-        """Before the backward pass: what was rendered of these samples, and is compared with photos."""
+        """Call before the backward pass, with what was rendered of these samples and what the loss compares."""
         residuals = [photo[..., :3] - picture for picture, photo in zip(pictures, photos, strict=True)]
         for info in (info for info in rendered.infos if "sums" in info):
             own = [place for place, raster in enumerate(rendered.rasters) if raster.info is info]
@@ -199,7 +196,7 @@ class Residuals:
                 self._asked.append((info["sums"], k, samples[place].view, error, samples[place].share))
 
     def found(self) -> list[Judged]:
-        """After it; then there are none. Nor are there any of a block of nobody."""
+        """Call after it. Gives each picture once, and none of a block without Gaussians."""
         asked, self._asked = self._asked, []
         known = ((sums.values, *rest) for sums, *rest in asked)
         return [Judged(view, sums[k], *rest) for sums, k, view, *rest in known if sums is not None]
@@ -214,14 +211,14 @@ def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "
 
 
 class Backgrounds:
-    """`background` on the device: of many steps in one copy."""
+    """`background` on the device."""
 
     def __init__(self, config: TrainingConfig, device: torch.device) -> None:
         self._config, self._device = config, device
         self._tables: dict[int, tuple[int, Float[Tensor, "s 3"]]] = {}
 
     def at(self, step: int, place: int) -> Float[Tensor, "3"]:
-        """What lies behind the scene in the sample at `place` of a step's batch."""
+        """See `background`."""
         if self._device.type == "cpu":
             return background(self._config, step, place)
         first = step - step % BACKGROUNDS
@@ -242,9 +239,8 @@ def random_part(crop: Crop, most: int, rng: random.Random) -> Crop:
     """One of the rectangles that a random grid cuts the crop into, as likely as it is large.
 
     The grid has as few columns and rows of equal cells as keep these within `most` pixels and nearly square.
-    Where a picture's loss is a sum over pixels, L = sum of l, the sum over a part, times crop.pixels /
-    part.pixels, has the expectation L whatever the grid: a part P is drawn with probability
-    P.pixels / crop.pixels, and the parts of a grid are all of the crop.
+    A loss that is a sum over pixels keeps its expectation whatever the grid, if that of a part is multiplied
+    by crop.pixels / part.pixels: a part is drawn with probability part.pixels / crop.pixels.
 
     Args:
         most: pixels of the part; 0 for no limit. A part may have ALIGN x ALIGN in any case.
@@ -281,7 +277,7 @@ def _side(start: int, size: int, count: int) -> int:
 
 
 def _random_span(start: int, size: int, count: int, rng: random.Random) -> tuple[int, int]:
-    """(first pixel, number of pixels) of the cell that a random pixel lies in."""
+    """First pixel and number of pixels of the cell that a random pixel lies in."""
     if count == 1:
         return start, size
     side, origin = _side(start, size, count), start - start % ALIGN

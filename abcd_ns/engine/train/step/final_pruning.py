@@ -1,14 +1,13 @@
 """Final pruning: when a run is complete, remove what its pictures hardly miss.
 
-Pruning in training (density/pruning) ends while there is time to make good what is missed, so that more is
-in a scene at its end than its pictures need. RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et al.,
-NeurIPS 2024) and Speedy-Splat (Hanson et al., CVPR 2025) leave out a given share of what ranks lowest. Here
-the pictures say how many: as many as training views can spare.
+RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et al., NeurIPS 2024) and Speedy-Splat (Hanson et al.,
+CVPR 2025) leave out a given share of what ranks lowest. Here the pictures say how many: as many as training
+views can spare.
 
-A pixel is linear in each Gaussian's opacity o, so that without the Gaussian it changes by o dC/do. What that
-is squared and summed over pixels is told by one drawing backward for all Gaussians at once (Hutchinson 1990):
-with a random sign for each pixel and channel as the gradient of the picture, the square of what comes back is
-it in expectation. As a share of the view's squared error it is the Gaussian's worth in dB, if it alone went.
+A pixel is linear in each Gaussian's opacity o, so that without the Gaussian it changes by o dC/do. One drawing
+backward tells the sum of its squares over pixels for all Gaussians at once (Hutchinson 1990): with random
+signs as the gradient of the picture, the square of what comes back is that sum in expectation. As a share of
+the view's squared error it is the Gaussian's worth in dB, if it alone went.
 """
 
 import math
@@ -43,7 +42,7 @@ MOST_RANKED = 256
 FEWEST, MOST, STEPS_EACH = 5, 32, 100
 """Views that tell how much may go: at least, at most, and steps of a short run for each."""
 ROUNDS = 6
-"""In the first so many are left out as should cost what may be; then twice that, or what halves the doubt."""
+"""Of trying how many may go: as many as should cost LOSS, then twice that, or what halves the doubt."""
 PER_NEPER = 10 / math.log(10)
 """dB that the logarithm of a squared error is worth."""
 OPAQUE = math.log(0.99 / 0.01)
@@ -53,7 +52,7 @@ LEAST_ERROR = 1e-10
 
 
 class _Probe:
-    """Opacities of a scene as leaves: of what comes back it keeps what Gaussians are worth."""
+    """Opacities of a scene as leaves, and what their gradients say that Gaussians are worth."""
 
     def __init__(self) -> None:
         self._leaves: dict[int, Tensor] = {}
@@ -68,28 +67,26 @@ class _Probe:
     def accumulate(self) -> None:
         """A view has been drawn backward, or what a node shows in it: a pixel has each Gaussian in one."""
         for block, logits in self._leaves.items():
-            if logits.grad is None:
-                continue
-            # By o dC/do = dC/dlogit / (1 - o).
-            change = logits.grad / torch.sigmoid(-logits.detach()).clamp_min(1e-6)
-            self._worth[block] = self._worth.get(block, 0.0) + change.flatten().square()
-            logits.grad = None
+            if logits.grad is not None:
+                # By o dC/do = dC/dlogit / (1 - o).
+                change = logits.grad / torch.sigmoid(-logits.detach()).clamp_min(1e-6)
+                self._worth[block] = self._worth.get(block, 0.0) + change.flatten().square()
+                logits.grad = None
 
     def worth(self, block: int, scene: BlockScene) -> Float[Tensor, "n"]:
-        """By now, of those that are drawn of the scene's block; 0 for who showed in no view."""
+        """Of those that are drawn of the scene's block; 0 for what showed in no view."""
         found = self._worth.get(block)
         return torch.zeros(len(scene.gaussians(block))) if found is None else found.cpu()
 
 
 class FinalPruning:
-    """Takes out of a run's scene, all of it stored, as many Gaussians as cost LOSS at most, by what `target`
-    says that views should show."""
+    """Takes as many Gaussians as cost LOSS at most out of a run's stored scene; `target` gives the photos."""
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
 
     def run(self) -> None:
-        """Do it; tells listeners how many went, and at what cost."""
+        """Rank, find out how many may go, and take them out; listeners hear how many, and at what cost."""
         run = self._run
         views, step = self._whole.views(), run.state.step
         scene = HeldScene(run.scene, run.device, self._room(views))
@@ -117,7 +114,7 @@ class FinalPruning:
         run.announce(PrunedAtEnd(gone, run.count(), len(views), before, after))
 
     def _room(self, views: Sequence[View]) -> int:
-        """Of a device, for blocks that are held there while none is active: a third of an active one's."""
+        """For blocks that are held on the device, bytes: a third of what an active one takes."""
         run, limit = self._run, self._run.config.limits.block_limit
         if run.device.type == "cpu":  # their RAM has a budget of its own
             return 0
@@ -126,8 +123,8 @@ class FinalPruning:
         return min(free, limit * needs.gaussian_bytes if limit else free) // 3
 
     def _worth(self, scene: BlockScene, views: list[View]) -> list[Float[Tensor, "_n"]]:
-        """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for who
-        shows in none of them, unless they are all."""
+        """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for
+        what shows in none of them, unless they are all."""
         run = self._run
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
@@ -153,23 +150,21 @@ class FinalPruning:
     def _psnr(
         self, scene: BlockScene, views: list[View], worth: Sequence[Tensor], least: float, rounds: int
     ) -> float:
-        """Mean over views without what is worth no more than `least`, dB; listeners are told how many rounds
-        are done."""
-        device = self._run.device
-        left = ChangedScene(scene, lambda block, found: found[(worth[block] > least).to(device)])
+        """Mean over views without what is worth no more than `least`, dB, after so many rounds."""
+        run, found = self._run, []
+        left = ChangedScene(scene, lambda block, drawn: drawn[(worth[block] > least).to(run.device)])
         pictures = self._whole.pictures(views, left)
-        found = []
-        self._run.announce(PhotosWanted(tuple(view.index for view in views)))
+        run.announce(PhotosWanted(tuple(view.index for view in views)))
         for view, picture in zip(views, pictures.draw(views), strict=True):
-            self._run.announce(Pruning(rounds, ROUNDS + 1))
+            run.announce(Pruning(rounds, ROUNDS + 1))
             square, counts = self._square(view, picture)
             error = square / (3 * counts.sum()).clamp_min(1.0)
             found.append(-10 * error.clamp_min(LEAST_ERROR).log10())
         return float(torch.stack(found).mean())
 
     def _square(self, view: View, picture: Raster) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
-        """The squared error of a picture, summed over the pixels that count, and which these are. It lies on
-        what training has behind it: on black alone, black things would not be missed."""
+        """The squared error of a picture, summed over the pixels that count, and which these are. It has
+        training's background: on black alone, black things would not be missed."""
         behind = background(self._run.config, view.index, 0).to(picture.color)
         shown = picture.color.detach() + picture.transmittance.detach()[..., None] * behind
         seen, photo, counts = self._whole.beside(view, shown, behind)
@@ -181,7 +176,7 @@ class FinalPruning:
         gone = int((worth <= least).sum())
         if gone:
             state = with_pending(scene, block)
-            stays = state.deferred.clone()  # who is not drawn
+            stays = state.deferred.clone()  # what is not drawn
             stays[~state.deferred] = worth > least
             run.persist(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone

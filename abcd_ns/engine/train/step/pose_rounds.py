@@ -18,8 +18,7 @@ from abcd_ns.engine.types import View
 FIRST = 16.0
 """Uses of each view by the whole scene before its pose is refined: from blobs, poses only become worse."""
 LATEST = 0.3
-"""Share of the run after which it is, whatever the uses: a run of thousands of photos may never come to so
-many, and where workers train blocks poses are refined in the warm-up alone."""
+"""Share of the run after which it is, whatever the uses: workers leave poses as the warm-up found them."""
 EVERY, SHARE = 1.0, 0.04
 """Uses of each view from round to round, at least, and as a share of all so far."""
 
@@ -51,33 +50,28 @@ class PoseRounds:
 
     def take(self) -> None:
         """Take a step for the pose of each view."""
-        run = self._run
-        views = self._whole.views()
+        run, views = self._run, self._whole.views()
         steps: dict[int, Tensor] = {}
         scene = run.scene
         if scene.is_active_as_a_whole:  # parted once, not for each block of each group
             scene = MemoryScene(scene.tree, scene.everything(run.device))
         pictures = self._whole.pictures(views, scene)
+        judged: dict[int, tuple[Raster, Float[Tensor, "h w 3"]]] = {}
+
+        def gradient(view: View, picture: Raster) -> Float[Tensor, "h w 3"]:
+            shown = picture.color.detach().requires_grad_()
+            seen, photo, counts = self._whole.beside(view, shown)
+            loss, weight = robust((seen - photo) * counts)
+            judged[view.index] = picture, weight * counts
+            (by_picture,) = torch.autograd.grad(loss, shown)
+            return by_picture
+
         for group in pictures.groups(views):
             run.announce(PhotosWanted(tuple(view.index for view in group)))
-            judged: dict[int, tuple[Raster, Tensor]] = {}
-
-            def gradient(view: View, picture: Raster, judged=judged) -> Tensor:
-                found, weight = self._judge(view, picture)
-                judged[view.index] = picture, weight
-                return found
-
+            judged.clear()
             found = pictures.differentiate(group, gradient)
             for view, by_matrix in zip(group, found, strict=True):
                 picture, weight = judged[view.index]
                 steps[view.index] = step_for(view, picture, weight, by_step(by_matrix, view.viewmat))
         run.poses.move(steps)
         run.state.posed = run.state.uses
-
-    def _judge(self, view: View, picture: Raster) -> tuple[Float[Tensor, "h w 3"], Tensor]:
-        """The gradient of the loss by the picture, and the weight of each pixel."""
-        shown = picture.color.detach().requires_grad_()
-        seen, photo, counts = self._whole.beside(view, shown)
-        loss, weight = robust((seen - photo) * counts)
-        (gradient,) = torch.autograd.grad(loss, shown)
-        return gradient, weight * counts
