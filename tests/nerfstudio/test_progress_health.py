@@ -11,7 +11,7 @@ from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, V
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Stopwatch
 from abcd_ns.nerfstudio.run import progress
-from abcd_ns.nerfstudio.run.progress import ProgressReport
+from abcd_ns.nerfstudio.run.progress import ProgressReport, summary
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 
@@ -65,6 +65,12 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 3: seen by 1 view only",
         "  3 oversized Gaussians shrunk",
     ]
+
+
+def test_blocks_that_were_all_trained_take_one_line_and_repairs_are_added_up():
+    health = {0: BlockHealth(visits=1, gradients=200), 1: BlockHealth(visits=1, gradients=1000)}
+    lines = ["all 2 blocks: trained", "1,200 gradients that were no numbers set to zero"]
+    assert summary(2, health, {0: 5, 1: 5}) == lines
 
 
 def test_the_end_names_the_degree_of_harmonics_where_not_all_came(coordinator, capsys):

@@ -1,7 +1,6 @@
 """Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
 
-`Visits` gives the coordinator its blocks, `VisitTraining` their gradients. What is not active is stored.
-Listeners are told what happens.
+`Visits` decides on the blocks, `VisitTraining` trains them. What is not active is stored.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -9,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import EpochEnded, VisitEnded
+from abcd_ns.engine.events import BlockSplit, EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
@@ -28,8 +27,7 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
 
 AT_ONCE = 1e-3
-"""Seconds: what a long visit persists is written as soon as no other write is under way. To count from that
-one, whose state may be old, a kill would lose twice `commit_seconds`."""
+"""Seconds: what a long visit persists is written as soon as no other write is under way."""
 
 
 class Coordinator(Trainer):
@@ -38,7 +36,7 @@ class Coordinator(Trainer):
     Args:
         visits: decides which; None for ABCD's own.
         room: for layers; None for little, on the device.
-        target: gives what a sample is trained on; needed where poses are refined, and for a final pruning.
+        target: gives what a sample is trained on; needed to refine poses, and for a final pruning.
     """
 
     def __init__(
@@ -57,8 +55,6 @@ class Coordinator(Trainer):
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
         prunes = target is not None and run.density.config.prunes
         self._final_pruning = FinalPruning(run, target) if prunes else None
-
-    # -- a step --------------------------------------------------------------------------------------
 
     @property
     def batch(self) -> int:
@@ -93,11 +89,8 @@ class Coordinator(Trainer):
 
     @property
     def finished(self) -> bool:
-        """Whether the budget is used up, and no block is active. A visit that was found not to be over just
-        before takes one more step."""
+        """Whether the budget is used up, and no block is active."""
         return self.state.active is None and super().finished
-
-    # -- a visit -------------------------------------------------------------------------------------
 
     def begin_visit(self) -> None:
         """Begin the next one."""
@@ -130,7 +123,7 @@ class Coordinator(Trainer):
 
     def complete(self) -> None:
         """End a visit that is under way, as where a run resumes for no more steps, and prune for the last
-        time if options and photos allow. A run that was killed meanwhile does it anew, with what is left."""
+        time if options and photos allow."""
         if self.state.active is not None:
             self.end_visit()
         if self._final_pruning is not None and self.state.pruned_at != self.state.step:
@@ -144,8 +137,6 @@ class Coordinator(Trainer):
         shown, owner = [run.views[view] for view in views], tree.assign(gaussians.means)
         return influence(gaussians, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
 
-    # -- persist and restore -------------------------------------------------------------------------
-
     @property
     def layer_bytes(self) -> int:
         return self.visit.layers.nbytes if self.visit.layers else 0
@@ -153,10 +144,12 @@ class Coordinator(Trainer):
     def persist_visit(
         self, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], epoch: int
     ) -> None:
-        """Persist what a visit changed, blocks that have outgrown their limit in parts; tell listeners. The
-        updates are what is persisted of `state`, which the visit made of its block."""
+        """Persist what a visit changed: the `updates` made of `state`, its block as trained. Cut blocks that
+        have outgrown their limit, and tell listeners."""
         run = self.run
-        tree, parts = cut_full(self.scene, updates, run.state, run.limits, run.announce)
+        tree, parts, parents = cut_full(self.scene, updates, run.state, run.limits)
+        for new, parent in parents.items():
+            run.announce(BlockSplit(parent, new))
         if active.is_joint and tree.num_blocks > 1:
             run.state.influence = self._influence(state, tree, run.views)
         run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)

@@ -42,8 +42,7 @@ DISTANCES_AT_ONCE = 1 << 22
 
 
 class Health:
-    """Watches the active block, through hooks in the optimizers; deals with oversized Gaussians only if it
-    `may_act`."""
+    """Watches the active block, through hooks in the optimizers; bounds its scales only if it `may_act`."""
 
     def __init__(
         self, scene: VisitScene, params: Params, optimizers: Optimizers, announce: Announcer, *, may_act: bool
@@ -78,8 +77,7 @@ class Health:
 
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped, with the mean squared error of each picture that the step drew.
-        Gives whether its gradients were all numbers, as far as known, and the mean PSNR, dB: on an
-        accelerator of the step before, NaN in a visit's first."""
+        Gives whether its gradients were all numbers, as far as known, and its PSNR, dB; see StepTaken."""
         self._send(errors)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
@@ -111,8 +109,7 @@ class Health:
 
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Logarithms of standard deviations that none but the spared may grow beyond. A value that is no
-        number bounds nothing."""
+        """Logarithms of standard deviations that none but the spared may grow beyond."""
         scales = self._params["scales"]
         _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
         return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
@@ -138,8 +135,6 @@ class Health:
         """Repair all that is no number in the active block; call before it is persisted."""
         self._read()
         self._repair()
-
-    # -- numbers -------------------------------------------------------------------------------------
 
     def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
         if self._guard is not None:
@@ -198,8 +193,6 @@ class Health:
         for moment in MOMENTS:
             adam[moment][rows] = 0.0
 
-    # -- accounts ------------------------------------------------------------------------------------
-
     def _send(self, errors: Sequence[Float[Tensor, ""]]) -> None:
         """All that the step tells, as one small tensor."""
         shares, self._shares = self._shares, []
@@ -247,8 +240,7 @@ class StepGuard:
         return all(optimizer.defaults.get("fused") for optimizer in self._optimizers.values())
 
     def record(self, optimizer: torch.optim.Optimizer, skips: bool) -> None:
-        """Call before it steps; with `skips` it does nothing if a gradient is no number. Those of all
-        optimizers are looked at before the first one steps."""
+        """Call before it steps. With `skips` all do nothing if any gradient is no number."""
         if not self._told or any(told is optimizer for told in self._told):
             self._told, self._found = [], self._begin(skips)
         self._told.append(optimizer)

@@ -21,8 +21,7 @@ class BlockHealth:
     moments: int = 0
     """Rows of Adam's moments likewise."""
     values: int = 0
-    """Gaussians that were no numbers: put back as they were stored or, where that is not known, replaced by
-    transparent ones."""
+    """Gaussians that were no numbers: put back as they were stored, or replaced by transparent ones."""
     oversized: int = 0
     """Gaussians that were shrunk."""
     pruned: int = 0
@@ -46,31 +45,3 @@ def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -
     if views.get(block, TOO_FEW_VIEWS + 1) <= TOO_FEW_VIEWS:
         return "seen by 1 view only" if views[block] == 1 else f"seen by {views[block]} views only"
     return "trained"
-
-
-def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int]) -> list[str]:
-    """Lines for the end of a run: how the blocks stand, and what had to be repaired. Blocks count from 1."""
-    by_standing: dict[str, list[int]] = {}
-    for block in range(blocks):
-        by_standing.setdefault(standing(block, health_by_block.get(block), views), []).append(block + 1)
-    if list(by_standing) == ["trained"]:
-        lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
-    else:
-        lines = []
-        for words, members in by_standing.items():
-            shown = ", ".join(map(str, members[:12])) + (", ..." if len(members) > 12 else "")
-            lines.append(f"{'block' if len(members) == 1 else 'blocks'} {shown}: {words}")
-    records = health_by_block.values()
-    totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
-    found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
-    return [*lines, ", ".join(found)] if found else lines
-
-
-REPAIRED = {
-    "gradients": "gradients that were no numbers set to zero",
-    "moments": "moments that were no numbers set to zero",
-    "values": "Gaussians that were no numbers replaced",
-    "oversized": "oversized Gaussians shrunk",
-    "pruned": "Gaussians pruned that filled too little of their views",
-}
-"""What the counts of a BlockHealth say."""

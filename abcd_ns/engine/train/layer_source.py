@@ -1,16 +1,23 @@
-"""Where a visit's layers come from: the frozen blocks, drawn around the one that is to be trained."""
+"""What draws a run's scene: the layers of a visit, and whole training views beside their photos."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from abcd_ns.engine.events import LayersDrawn
 from abcd_ns.engine.layers.layer_renderer import PARTS_BYTES, LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import View
 
 
@@ -32,8 +39,8 @@ def layers_of_visit(
     run: TrainingRun, room: LayerRoom, active: ActiveVisit, views: Iterable[int]
 ) -> VisitLayers | None:
     """F and B of these views, or None where nothing is around the block; listeners hear of each."""
-    config = run.config
-    if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
+    recipe = run.config.recipe
+    if active.is_alone or run.scene.tree.num_blocks == 1 or not recipe.layers:
         return None
     layers = VisitLayers(
         renderer_of(run, run.scene),
@@ -41,9 +48,9 @@ def layers_of_visit(
         active.geometry,
         run.scene.stored_with_pending(active.geometry.block),
         run.views,
-        RenderSettings(active.sh_degree, config.antialiased),
+        RenderSettings(active.sh_degree, run.config.antialiased),
         active.visible,
-        window_weight=config.recipe.window_weight,
+        window_weight=recipe.window_weight,
         parts_bytes=parts_bytes(run, run.views.values(), blocks=2),
         backwards=active.number % 2 == 1,
     )
@@ -58,8 +65,43 @@ def layers_of_visit(
     return layers
 
 
+class WholeViews:
+    """Draws a run's scene in its training views, beside what `target` says that they should show."""
+
+    def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
+        self._run, self._target = run, target
+
+    def views(self) -> list[View]:
+        """All of them, with pictures as the run has them by now, and none larger than a step may draw."""
+        run, reduction = self._run, self._run.reduction
+        most = run.config.limits.crop_pixels
+        while most and max(view.full.pixels for view in run.views_at(reduction).values()) > most:
+            reduction *= 2
+        return list(run.views_at(reduction).values())
+
+    def pictures(self, views: list[View], scene: BlockScene) -> WholePictures:
+        """Draws these views of a scene: the run's, or what it would be."""
+        run = self._run
+        # Half of what a visit's have: here a view is drawn backward beside them.
+        room = parts_bytes(run, views, run.blocks, share=0.5)
+        renderer = renderer_of(run, scene)
+        return WholePictures(renderer, RenderSettings(run.sh_degree, run.config.antialiased), room)
+
+    def beside(
+        self, view: View, shown: Float[Tensor, "h w 3"], behind: Float[Tensor, "3"] | None = None
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
+        """A picture in its photo's light, not clamped; the photo, on `behind`, None for black; 1 where pixels
+        count, else 0."""
+        sample = Sample(view, view.full, None, None, shown.new_zeros(3) if behind is None else behind)
+        photo, counts = self._target(sample)
+        light = self._run.light
+        seen = shown if light is None else lit(shown, light.of(view.index).detach())
+        counted = torch.ones_like(seen[..., :1]) if counts is None else counts.to(seen)
+        return seen, photo.to(seen), counted
+
+
 def renderer_of(run: TrainingRun, scene: BlockScene) -> LayerRenderer:
-    """What draws a scene, the run's or what it would be, as the run's options have it."""
+    """What draws a scene, the run's or another, by the run's options."""
     return LayerRenderer(
         scene,
         run.rasterizer,
@@ -70,8 +112,7 @@ def renderer_of(run: TrainingRun, scene: BlockScene) -> LayerRenderer:
 
 
 def parts_bytes(run: TrainingRun, views: Iterable[View], blocks: int, share: float = 1.0) -> int:
-    """Size of the layers that may be held while nodes are folded, where steps train by one block or several;
-    of an accelerator a share of what it has for them."""
+    """Size of the layers that may be held while nodes are folded; a share of the room of an accelerator."""
     if run.device.type == "cpu":  # where a block is loaded from RAM to RAM
         return PARTS_BYTES
     needs = needs_of(run.config, max(view.full.pixels for view in views), blocks)

@@ -23,11 +23,9 @@ from abcd_ns.units import bytes_in_words
 FLOAT = 4
 """Bytes."""
 PROJECTED_FLOATS = 8.2
-"""Of each row of a Gaussian in one view: itself, copies sorted by tile, the gradients of all these, and
-sums of residuals."""
+"""Of each row of a Gaussian in a view: itself, copies sorted by tile, their gradients, sums of residuals."""
 KEPT_FLOATS = 12
-"""Of a Gaussian in a view that was drawn before the last of its step: a weight, its gradient, and sums of
-residuals."""
+"""Of a Gaussian in a view that its step drew before the last: a weight, its gradient, sums of residuals."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
@@ -73,8 +71,7 @@ class DeviceNeeds:
 
     @property
     def gaussian_bytes(self) -> int:
-        """Of one Gaussian in training: parameters, gradient, two moments, and what its views' drawings hold.
-        Refining takes no more: gradients are gone by then."""
+        """Of one Gaussian in training: parameters, gradient, two moments, and what drawings hold of it."""
         drawn = self.batch * projected_bytes(self.primitive) + self.waiting * KEPT_FLOATS * FLOAT
         return 4 * self.parameter_bytes + drawn
 
@@ -140,8 +137,8 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
 
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | None = None) -> DeviceNeeds:
-    """What a visit takes on images of so many pixels at most, in one block or several, whose degree is
-    `sh_degree`; None for the one that limits count on."""
+    """What a visit takes, with images of so many pixels at most, in a scene of so many blocks. Their degree
+    is `sh_degree`; None is `growing_degree`."""
     return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
 
@@ -172,8 +169,7 @@ def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
 
 
 def degree_with_room(config: TrainingConfig, largest: int, blocks: int) -> int:
-    """The highest degree of harmonics for which there is room in the largest of so many blocks, which has
-    `largest` Gaussians."""
+    """The highest degree for which the largest of so many blocks, of `largest` Gaussians, has room."""
     least = config.growing_degree
     degrees = range(config.sh_degree, least, -1)
     return next((d for d in degrees if largest <= FULL * limits_at(config, d).of_block(blocks)), least)
@@ -199,7 +195,7 @@ def projected_bytes(primitive: PrimitiveName) -> int:
 
 
 def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
-    """What a Gaussian takes while it is drawn without gradients: its parameters and rows of one view, twice."""
+    """Of a Gaussian that is drawn without gradients: its parameters and its rows of one view, both twice."""
     return 2 * parameter_bytes(sh_degree) + 2 * PRIMITIVES[primitive].rows * FLOAT
 
 

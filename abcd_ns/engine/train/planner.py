@@ -43,8 +43,7 @@ class Visits(ABC):
         NothingSeenError if no view sees any block."""
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
-        """Its block is active, at the visit's beginning or after a resume. What others see of it meanwhile:
-        all that is active."""
+        """Call when the visit's block has become active. Gives what others see of it meanwhile: all of it."""
         return lambda: active_gaussians(params)
 
     @abstractmethod
@@ -57,17 +56,15 @@ class Visits(ABC):
 
 
 class Planner(Visits):
-    """ABCD's visits: epochs over all blocks that any view sees, after a warm-up; all that it remembers is in
-    the run's state."""
+    """ABCD's visits: after a warm-up, epochs over all blocks that any view sees."""
 
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
-        """The warm-up, or a visit to the next block that some view sees; most of the time blocks are passed
-        over that no picture showed when they were last visited. A BlocksBusyError if the blocks that are left
-        in this epoch are in flight."""
+        """The warm-up, or a visit to the next block that some view sees; most epochs pass over blocks that no
+        picture showed last time. A BlocksBusyError if all that are left in this epoch are in flight."""
         run, state = self._run, self._run.state
         began = run.stopwatch.seconds
         if run.warm_up_is_next:
@@ -139,8 +136,7 @@ class Planner(Visits):
         )
 
     def _sole_visit(self, block: int, showing: tuple[int, ...]) -> ActiveVisit:
-        """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
-        block may grow anywhere."""
+        """The visit to a block that is the whole scene: for the rest of the run, on whole views."""
         run, total = self._run, self._run.budget.steps
         steps = UNLIMITED if total is None else total - run.state.step
         geometry = VisitGeometry(block, {view: run.views[view].full for view in showing})
@@ -161,7 +157,9 @@ class Planner(Visits):
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
         recipe, state, blocks = self._config.recipe, self._run.state, self._scene.tree.num_blocks
         if not state.views:
-            state.views = {block: self._views_showing(block) for block in range(blocks)}
+            for block in range(blocks):  # a visit looks again
+                known = self._known_to_show(block, state.influence.get(block, ()))
+                state.views[block] = len(known) or self._views_seeing(block)
         else:
             state.epoch += 1
             for block, seen in state.views.items():
@@ -193,11 +191,6 @@ class Planner(Visits):
         limit = self._config.recipe.visit_views
         return schedule.views_per_visit(seen, _typical(self._run.state.views), limit) if seen else 0
 
-    def _views_showing(self, block: int) -> int:
-        """As many as are worth training it on, if that is known; a visit looks again."""
-        known = self._known_to_show(block, self._run.state.influence.get(block, ()))
-        return len(known) or self._views_seeing(block)
-
     def _views_seeing(self, block: int) -> int:
         views = self._may_see(block)
         return len(self._sampled(block, views) or self._seeing(block, views))
@@ -221,7 +214,6 @@ class Planner(Visits):
         return tuple(view for view, held in zip(views, holds, strict=True) if held)
 
     def _seeing(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
-        """Those of the views that see the block."""
         return self._footprints(block, views).views
 
     def _may_see(self, block: int) -> dict[int, View]:

@@ -12,46 +12,36 @@ class Recipe:
     """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
     overlap: float = 0.0
     """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each
-    face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` and `migrate`
-    off."""
+    face by this share of its extent. Needs `layers` and `migrate` off."""
     exact: bool = False
     """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
-    Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""
+    Slow; the reference for gradients. What concerns visits has no effect."""
     ownership: Literal["fragments", "means"] = "fragments"
-    """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
-    paper)."""
+    """What a layer holds: fragments in a cell (exact) or, as in the paper, Gaussians with means in it."""
     window_weight: float = 0.06
-    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each tile of
-    4 x 4 pixels (gsplat: 16 x 16). This share of the block's weight, in a picture of it alone, may lie nearer
-    than the nearest that counts, and as much farther than the farthest. 0 counts all: exact and slow."""
+    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, tile by tile.
+    This share of the block's weight, in a picture of it alone, may lie nearer than the nearest that counts,
+    and as much farther than the farthest. 0 counts all: exact and slow."""
     influence_share: float = 0.995
-    """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
-    the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
-    share of what it weighs there alone. 1 takes all views and pixels that it may touch, and layers of all
-    blocks."""
+    """A block is trained on the fewest views with this share of its influence, and in each on a crop with
+    this share of its weight. 1 takes all views and pixels that it may touch, and layers of all blocks."""
     visit_views: int = 64
-    """Views that a visit uses of a block that as many views see as the median block. Others use the same
-    share of theirs, and twice as many at most."""
+    """Views that a visit to the median block uses; others the same share of theirs, at most twice this."""
     passes: int = 8
-    """Uses of each of these views in a visit, where they are 32 or fewer; in proportion fewer uses where they
-    are more."""
+    """Uses of each of these views in a visit; in proportion fewer where they are more than 32."""
     visit_steps: int = 0
-    """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
-    views."""
+    """Steps of every visit, as the paper has; 0 shares steps out by views."""
     keep_moments: bool = True
-    """A block keeps Adam's moments and densification's statistics from visit to visit. Off, as in the paper,
-    every visit begins with new ones."""
+    """A block keeps Adam's moments and densification's statistics from visit to visit. Off in the paper."""
     migrate: bool = True
-    """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
-    paper, they are deleted."""
+    """Gaussians that left their cell in a visit move to another block. Off in the paper: they are deleted."""
     sh_restart: bool = False
-    """The degree of spherical harmonics rises from 0 in every visit, over `sh_ramp` of its steps, as in the
-    paper; frozen blocks are then drawn with the highest."""
+    """The degree of spherical harmonics rises from 0 in every visit, as in the paper; frozen blocks are then
+    drawn with the highest."""
     sh_ramp: float = 0.1
     """Share of the run over which the degree rises from 0 to the highest."""
     limit_scales: bool = True
-    """Shrink oversized Gaussians where blocks are trained within layers, and let none grow.
-    Non-finite values are repaired in any case."""
+    """Shrink oversized Gaussians where blocks are trained within layers, and let none grow."""
     means_lr_decay: float = 0.1
     """What the means' learning rate falls to over the run, exponentially, as a share. The final decay takes
     another tenth, which together is 3DGS's hundredth."""
@@ -70,26 +60,21 @@ FULL = 0.75
 
 @dataclass(frozen=True)
 class Limits:
-    """What fits on the device: `ns-train` derives it from the memory that training may take. 0 is no limit
-    but where another meaning stands."""
+    """What fits on the device; `ns-train` derives it from its memory. 0 is no limit unless said otherwise."""
 
     block_limit: int = 0
-    """Gaussians that a block may hold while it is trained; one that comes near it is cut in two when its
-    visit ends."""
+    """Gaussians that a block may hold while it is trained; one over FULL of it is cut when its visit ends."""
     sole_limit: int = 0
-    """The same for a block that is the whole scene: it has no neighbours, and draws one view in a step, so
-    there is room for more. 0 takes `block_limit`."""
+    """The same for a block that is the whole scene, which draws one view in a step. 0 takes `block_limit`."""
     batch_limit: int = 0
     """Views of a step that are drawn at once, at most; the others follow. Results agree to rounding."""
     crop_pixels: int = 0
-    """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
-    another one each time, and weighs it by how much of the crop it leaves out."""
+    """Pixels of a view that a step trains on at most: a random part of larger crops, see `random_part`."""
     coarse_gaussians: int = 0
-    """Gaussians of the warm-up's coarse model at most, see `memory.coarse_model_size`; 0 is as many as there
-    are in the beginning."""
+    """Gaussians of the warm-up's coarse model at most; 0 is as many as there are in the beginning."""
     late_harmonics: int = 0
-    """Degrees of spherical harmonics that blocks do not have while they grow, which the other limits count
-    on. They come once growth is over, as far as there is room."""
+    """Degrees of spherical harmonics that come once growth is over, as far as there is room. The other limits
+    count on that."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
 

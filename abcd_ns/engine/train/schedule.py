@@ -19,8 +19,8 @@ UNDER_TRAINED = 500
 """Views that a block was trained on, warm-up included, below which its steps draw one; two below twice as
 many, and so on. Its steps are as large whatever they draw, see `rates_of_under_trained`."""
 COARSE_MODEL_PASSES, WARM_UP_PASSES, LONGER = 24, 32, 2.4
-"""Uses of each view in the warm-up: the first at most, where not all Gaussians have room; elsewhere the second
-at least, but no longer than so many times its share of the run."""
+"""Uses of each view in the warm-up: the first at most, where not all Gaussians have room. Elsewhere the
+second at least, but no longer than so many times its share of the run."""
 LEAST_SIDE = 100
 """Of a reduced picture, pixels, at least."""
 FEW_VIEWS = 32
@@ -91,8 +91,7 @@ def plan_epoch(
 
 
 def views_per_step(batch: int, blocks: int, trained: int | None = None) -> int:
-    """`TrainingConfig.batch`, its 0 resolved for a block that was trained on so many views; None for the most
-    that a step draws."""
+    """Resolves `TrainingConfig.batch` for a block that was trained on so many views; None for the most."""
     if batch:
         return batch
     most = 1 if blocks == 1 else DEFAULT_BATCH
@@ -159,15 +158,14 @@ def final_decay(progress: float, views: int) -> float:
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:
-    """By how much pictures are reduced: to a quarter, then to half their width, and after the share `coarse`
-    of the run not at all; `shortest` is the least side of any, pixels."""
+    """By how much pictures are reduced: to a quarter, then to half their width, until the share `coarse` of
+    the run; `shortest` is the least side of any, pixels."""
     wanted = 4 if progress < coarse / 2 else 2 if progress < coarse else 1
     return max(by for by in (1, 2, 4) if by == 1 or (by <= wanted and shortest // by >= LEAST_SIDE))
 
 
 def sh_degree_at(progress: float, ramp: float, highest: int) -> int:
-    """The degree of spherical harmonics in use: one more at each third (for degree 3) of the ramp. A ramp of
-    0.1 of 30,000 steps is splatfacto's one degree every 1,000 steps."""
+    """The degree of spherical harmonics in use: one more at each third (for degree 3) of the ramp."""
     if ramp <= 0:
         return highest
     # 1e-9 keeps degree n exactly at n / highest of the ramp, where the product may fall just below n.

@@ -1,7 +1,7 @@
 """What the caller of a training deals with, however blocks are trained.
 
-The optimisation loop belongs to the caller (nerfstudio's trainer, or `training_loop`): it asks for a batch,
-renders it, takes the gradient of its loss, steps its optimizers, and reports back.
+The caller owns the loop: it asks for a batch, renders it, takes the gradient of its loss, steps the
+optimizers, and reports back.
 """
 
 from abc import ABC, abstractmethod
@@ -32,8 +32,6 @@ class Trainer(ABC):
         self.params, self.optimizers, self.device = run.params, run.optimizers, run.device
         self.announce, self.health = run.announce, run.health
 
-    # -- a step --------------------------------------------------------------------------------------
-
     @property
     @abstractmethod
     def batch(self) -> int:
@@ -53,13 +51,11 @@ class Trainer(ABC):
 
     @abstractmethod
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """Call after the optimizers stepped, with what all parts of the step drew, or what is kept of it, and
-        each picture's mean squared error; listeners are told the mean PSNR."""
+        """Call after the optimizers stepped, with what all parts of the step drew (`Rendered.kept` suffices)
+        and each picture's mean squared error."""
 
     def complete(self) -> None:  # noqa: B027 - most have nothing left to do
         """Call when the run is finished: does what comes after the last step, if it was not done."""
-
-    # -- elsewhere -----------------------------------------------------------------------------------
 
     def await_step(self) -> None:
         """Return when one more step of the run has been taken elsewhere, or the run is finished."""
@@ -79,8 +75,6 @@ class Trainer(ABC):
     def resume(self) -> None:
         """Time counts again; steps do this by themselves."""
         self.stopwatch.start()
-
-    # -- where it stands -----------------------------------------------------------------------------
 
     @property
     def state(self) -> RunState:
@@ -110,8 +104,6 @@ class Trainer(ABC):
     def count(self) -> int:
         """Gaussians in the whole scene, what is active included."""
         return self.run.count()
-
-    # -- persist and restore -------------------------------------------------------------------------
 
     @abstractmethod
     def persist(self, within: float) -> None:

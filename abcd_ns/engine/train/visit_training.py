@@ -79,8 +79,6 @@ class VisitTraining:
                 gaussians, run.rasterizer, whole.shot, whole.in_front, antialiased=run.config.antialiased
             )
 
-    # -- a step --------------------------------------------------------------------------------------
-
     def next_batch(self) -> Batch:
         """As Trainer.next_batch; listeners are told the views of the steps to come, too."""
         run = self.run
@@ -131,8 +129,7 @@ class VisitTraining:
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
-        """Views of several sizes may have another order in the infos, and views that are drawn in part tell
-        only of that: these are drawn again afterwards."""
+        """But not of views of several sizes, whose order may differ in infos, nor of views drawn in part."""
         most = self.run.config.limits.crop_pixels
         in_part = most and any(view.full.pixels > most for view in rendered.views)
         if self.influence is None or in_part or len(rendered.infos) != 1:
@@ -175,8 +172,6 @@ class VisitTraining:
         self.run.health.end_visit()
         self.layers = None
         return state
-
-    # -- what is drawn -------------------------------------------------------------------------------
 
     def whole(self, view: int) -> Sample:
         """All that a view shows of the block in this visit."""

@@ -3,7 +3,7 @@
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import psutil
 import torch
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from abcd_ns.data.input_errors import say
 from abcd_ns.engine import events
-from abcd_ns.engine.train.health_record import REPAIRED, summary
+from abcd_ns.engine.train.health_record import HealthByBlock, standing
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
@@ -25,6 +25,14 @@ SECONDS_BETWEEN_LINES, SECONDS_BETWEEN_LOOKS = 10.0, 0.1
 SMOOTHING = 0.98  # weight of the PSNR that was shown before
 ALARMING = ("gradients", "moments", "values")
 """Repairs that are printed at once; the others are counted for the end."""
+REPAIRED = {
+    "gradients": "gradients that were no numbers set to zero",
+    "moments": "moments that were no numbers set to zero",
+    "values": "Gaussians that were no numbers replaced",
+    "oversized": "oversized Gaussians shrunk",
+    "pruned": "Gaussians pruned that filled too little of their views",
+}
+"""What the counts of a BlockHealth say."""
 
 
 class ProgressReport:
@@ -181,3 +189,21 @@ def _at_work(workers: Sequence[events.WorkerSeen]) -> str:
     busy = [str(worker.block + 1) for worker in workers if worker.block is not None]
     which = f": blocks {', '.join(busy[:4])}{', ...' if len(busy) > 4 else ''}" if busy else ""
     return f"{len(busy)} of {len(workers)} workers busy{which}"
+
+
+def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int]) -> list[str]:
+    """Lines for the end of a run: how the blocks stand, and what had to be repaired. Blocks count from 1."""
+    by_standing: dict[str, list[int]] = {}
+    for block in range(blocks):
+        by_standing.setdefault(standing(block, health_by_block.get(block), views), []).append(block + 1)
+    if list(by_standing) == ["trained"]:
+        lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
+    else:
+        lines = []
+        for words, members in by_standing.items():
+            shown = ", ".join(map(str, members[:12])) + (", ..." if len(members) > 12 else "")
+            lines.append(f"{'block' if len(members) == 1 else 'blocks'} {shown}: {words}")
+    records = health_by_block.values()
+    totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
+    found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
+    return [*lines, ", ".join(found)] if found else lines

@@ -10,7 +10,7 @@ from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import OVERSIZED_ANGLE, Health, stand_ins, unsound
-from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
+from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_room, parameter_bytes
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -183,12 +183,6 @@ def test_how_blocks_stand_is_said_in_words():
         "seen by no view, left as it was",
         "trained",
         "not visited yet",
-    ]
-    lines = summary(6, health_by_block, views)
-    assert "block 4: seen by no view, left as it was" in lines
-    assert lines[-1].startswith("1,200 gradients that were no numbers set to zero")
-    assert summary(2, {0: BlockHealth(visits=1), 1: BlockHealth(visits=1)}, {0: 5, 1: 5}) == [
-        "all 2 blocks: trained"
     ]
 
 

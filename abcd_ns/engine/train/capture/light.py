@@ -1,7 +1,4 @@
-"""The light each photo was taken in: a colour transform of its finished picture, found while training.
-
-F, the active block, B and the background are composited first, so that no layer depends on a transform.
-"""
+"""The light each photo was taken in: a colour transform of its composited picture, found while training."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
@@ -30,7 +27,7 @@ TABLE_ROWS = 1820
 
 class Light:
     """A transform for each view, [3, 4], by which colour c becomes M c + o. All begin as the identity, which
-    is always their mean: otherwise the scene's colours would drift, and the transforms with them.
+    is always their mean: otherwise the scene's colours would drift.
 
     Args:
         kind: `exposure` leaves a gain for each channel, `affine` everything free.
@@ -57,8 +54,7 @@ class Light:
 
     @torch.no_grad()
     def step(self, gradients: Gradients, damping: float = 1.0) -> None:
-        """Take a step of Adam (Kingma and Ba 2015, algorithm 1) with damped rates, for each view that is
-        shown its own: the others keep their transforms and moments. What is no number counts as zero."""
+        """Take a step of Adam with damped rates for each of these views. What is no number counts as zero."""
         if not gradients:
             return
         of_views: dict[int, Tensor] = {}
@@ -79,22 +75,19 @@ class Light:
         self._changes[places] = after
         self._sum += (after.to(self._sum) - before.to(self._sum)).sum(dim=0)
 
-    # -- persist and restore -------------------------------------------------------------------------
-
     def changed(self) -> dict[str, Packed]:
         """All that has changed since the last call, by the names to keep it under; shares no memory."""
         parts, tables = {row // TABLE_ROWS for row in self._stepped}, {}
         self._stepped.clear()
         for part in sorted(parts | {0}) if parts else ():
             tensors = {name: value.to("cpu", copy=True) for name, value in self._tensors(part).items()}
-            tables[_name(part)] = Packed(tensors, {"kind": self.kind})
+            tables[f"light-{part}"] = Packed(tensors, {"kind": self.kind})
         return tables
 
     def restore(self, table: Callable[[str], Packed | None]) -> None:
-        """Stand where all that `changed` ever gave was kept, which `table` finds by name; a UserError if
-        these are transforms of another kind."""
+        """Read back what `changed` gave, by name; a UserError if these are transforms of another kind."""
         for part in range(-(-len(self._rows) // TABLE_ROWS)):
-            kept = table(_name(part))
+            kept = table(f"light-{part}")
             if kept is None:
                 continue
             if kept.meta["kind"] != self.kind:
@@ -130,7 +123,3 @@ def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Flo
     """A composited picture in a photo's light, M c + o in each pixel, not clamped."""
     matrix = transform.to(picture.dtype)
     return picture @ matrix[:, :3].T + matrix[:, 3]
-
-
-def _name(part: int) -> str:
-    return f"light-{part}"

@@ -1,8 +1,7 @@
 """Where each photo was taken from, refined while training: turned and moved a little from what was given.
 
 A pose has six numbers, how the camera turns and moves in its own frame (SO3xR3, as nerfstudio's camera
-optimizer has it). All poses together may not be turned, moved or scaled: the scene would follow, and whoever
-looks at it from elsewhere, held-out views first of all, would look past it.
+optimizer has it). All poses together may not be turned, moved or scaled: held-out views would not follow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +41,7 @@ class Poses:
         return {index: view.viewmat for index, view in moved}
 
     def move(self, steps: Mapping[int, Float64[Tensor, "6"]]) -> None:
-        """Take a step for each of these views, see `turned`; then all are laid over those that were given."""
+        """Take a step for each of these views, see `turned`; then lay all over those that were given."""
         views = sorted(self._given)
         given, now = ([some[view].viewmat.double() for view in views] for some in (self._given, self.views))
         for place, view in enumerate(views):
@@ -52,7 +51,7 @@ class Poses:
         self._place(dict(zip(views, laid, strict=True)))
 
     def packed(self) -> dict[int, bytes]:
-        """Those that are refined, bit for bit."""
+        """See `refined`, bit for bit."""
         return {view: pose.cpu().contiguous().numpy().tobytes() for view, pose in self.refined.items()}
 
     def restore(self, packed: Mapping[int, bytes]) -> None:
@@ -72,8 +71,7 @@ class Poses:
 
 
 def turned(viewmat: Float64[Tensor, "4 4"], step: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
-    """A camera after it turned about its own place, radians about its axes, and moved, world units along
-    them: what it sees turns and moves by `step`."""
+    """A camera whose view turned by `step`, radians about its axes, and moved along them, world units."""
     moved = torch.eye(4, dtype=viewmat.dtype)
     moved[:3, :3], moved[:3, 3] = torch.matrix_exp(_cross(step[:3])), step[3:]
     return moved @ viewmat
@@ -95,11 +93,8 @@ def robust(residual: Float[Tensor, "h w 3"]) -> tuple[Tensor, Float[Tensor, "h w
 def step_for(
     view: View, picture: Raster, weight: Float[Tensor, "h w 3"], gradient: Float64[Tensor, "6"]
 ) -> Float64[Tensor, "6"]:
-    """A step of Gauss and Newton towards less of a robust loss, damped.
-
-    The gradient is exact. For the matrix, pixels move as their depth says and bring their colour along (Lucas
-    and Kanade 1981): no drawing is needed for it.
-    """
+    """A damped step of Gauss and Newton towards less of a robust loss. The gradient is exact; for the matrix,
+    pixels move as their depth says and bring their colour along (Lucas and Kanade 1981)."""
     flow = _flow(view, picture)
     across, down = _slopes(picture.color)
     change = across[..., None] * flow[0][..., None, :] + down[..., None] * flow[1][..., None, :]
@@ -123,8 +118,7 @@ def laid_over(moved: Float64[Tensor, "n 4 4"], given: Float64[Tensor, "n 4 4"]) 
 
 
 def _together(viewmats: Float64[Tensor, "n 4 4"]) -> Float64[Tensor, "m 7"]:
-    """The steps of all cameras, one after the other, where the world turns, moves, or grows about their mean;
-    in units of their mean distance from it."""
+    """The steps of all cameras where the world turns, moves, or grows about their mean."""
     turns = viewmats[:, :3, :3]
     centers = -(turns.mT @ viewmats[:, :3, 3:])[..., 0]
     away = centers - centers.mean(dim=0)

@@ -34,8 +34,8 @@ RIDGE = 1e-3 / (4 * torch.pi)
 REACH = 3.0
 """Standard deviations up to which a Gaussian shows, about."""
 AT_ONCE, OF_EACH = 1 << 22, 32
-"""Numbers of a tensor, about, where Gaussians are fitted part by part: so many, or so many for each Gaussian
-where that is more, half of what gradients take. However large a block is, an accelerator has few parts."""
+"""Numbers of a tensor where Gaussians are fitted part by part: so many, or so many for each Gaussian where
+that is more, which is half of what gradients take."""
 
 
 class Lowered(NamedTuple):
@@ -58,7 +58,7 @@ def are_gone(
 def lower(
     params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], highest: int
 ) -> dict[str, Tensor]:
-    """Let harmonics of the active block go that do not pay, see `lowered`; gives its statistics afterwards."""
+    """Let harmonics of the active block go that do not pay, see `lowered`; gives its statistics from then."""
     if not have_contributions(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
@@ -74,8 +74,8 @@ def lower(
 def lowered(
     gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View], highest: int
 ) -> Lowered:
-    """Gaussians with the degrees that pay, by the BLEND_SUMS of the views that their block is trained on; the
-    scene's degree is the highest. None is judged that was not drawn in all views yet."""
+    """Gaussians with the degrees that pay, by the block's BLEND_SUMS and views; `highest` is the scene's
+    degree. None is judged that was not drawn in all views yet."""
     weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
     chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]

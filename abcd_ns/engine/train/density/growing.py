@@ -1,8 +1,7 @@
 """Growing: one Gaussian becomes two, side by side along one of its axes.
 
-3DGS (Kerbl et al., 2023) puts a copy onto a small one, whose picture is then as of two, and draws at random
-where the halves of a large one go: either upsets the picture, for tens of steps. Here the two have together
-the optical depth, the middle and the variance of the one.
+3DGS (Kerbl et al., 2023) doubles a small one in place and puts the halves of a large one at random: either
+upsets the picture. Here the two together have the optical depth, the middle and the variance of the one.
 """
 
 from collections.abc import Mapping
@@ -18,16 +17,15 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 
 APART, NARROWED = 0.8, 0.6
-"""Of the standard deviation of the one along its axis: how far from its middle the two lie, and their own.
-The squares add up to 1, so that the variance of both together is that of the one."""
+"""Shares of the one's standard deviation along its axis: how far from its middle the two lie, and their own.
+The squares add up to 1, so that variances agree."""
 LEAST = 1e-6
 """Transmittance of the most opaque, whose optical depth would have no end."""
 WEIGHT = BLEND_SUMS[0]
 
 
 def chosen(wanted: Float[Tensor, "n"], room: int) -> Bool[Tensor, "n"]:
-    """Which are to become two: all that want to, by more than 0, or as many of them as there is room for, of
-    which those that want to most."""
+    """Which are to become two: all above 0 or, as far as there is room, the largest."""
     which = wanted > 0
     if int(which.sum()) <= room:
         return which

@@ -1,11 +1,10 @@
 """Pruning: remove a Gaussian whose contribution to its views is below the minimum.
 
 What a Gaussian weighs in a picture is the sum over pixels of alpha T, the transmittance of whatever lies
-before its block included: so many pixels it fills. Drawings that train it tell for nothing (see
-`with_blend_weights`). Added up over the views of its block it says what would be missing without it, as
-RadSplat (Niemeyer et al., 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the
-sum of such weights when training ends. Here they go while it goes on, at a minimum that rises as growth comes
-to its end: those that remain take their place, and each step costs less.
+before its block included: so many pixels it fills. Drawings that train it tell for nothing, see
+`with_blend_weights`. RadSplat (Niemeyer et al., 2024) prunes by the largest of such weights and LightGaussian
+(Fan et al., NeurIPS 2024) by their sum when training ends. Here Gaussians go while it goes on, by the sum, at
+a minimum that rises until growth ends.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,15 +24,13 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View, centers_of
 
 BLEND_SUMS = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
-trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used. A reduced
-picture's pixel counts as one: so little grows before pictures are large enough to tell."""
+trained on; a drawing of one of n views is 1/n of a pass. A reduced picture's pixel counts as one."""
 FULL_PASS = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 FAINT, FAINTER = 0.1, 0.25
-"""What fills more than most is a floater if its opacity is below the first, and below this share of the
-median: at first all are faint."""
+"""What fills more than most is a floater if its opacity is below the first, and this share of the median."""
 PASSES = 4
 """A block that is the whole scene is judged whenever each of its views was drawn so often."""
 
@@ -53,16 +50,16 @@ class _BlendWeight(torch.autograd.Function):
 
 
 def with_blend_weights(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float) -> Raster:
-    """The same drawing, made with `blend_weights`; backward leaves in `info["weights"].grad` what each
-    Gaussian weighs in its picture, by the transmittance `in_front` and the share of pixels that are drawn."""
+    """The same drawing, made with `blend_weights`, whose backward leaves in `info["weights"].grad` what each
+    Gaussian weighs, by the transmittance `in_front` and the share of pixels that are drawn."""
     counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
     color = _BlendWeight.apply(raster.color, raster.depth, counts.detach() / share)
     return Raster(color, raster.transmittance, raster.depth, raster.info)
 
 
 def blend_sums(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
-    """What drawings add to BLEND_SUMS, after backward, where a block is trained on so many views; each [n].
-    Nothing if they were drawn without weighing."""
+    """What drawings, after backward, add to BLEND_SUMS of a block with so many views, each [n]; {} if nothing
+    was weighed."""
     found = [info["weights"].grad for info in infos if "weights" in info]
     if not found or any(weights is None for weights in found):
         return {}
@@ -78,8 +75,7 @@ def have_contributions(growth: Mapping[str, Tensor]) -> bool:
 
 
 def contributions(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
-    """Pixels that each fills in all of its block's views together, by BLEND_SUMS; NaN for one that was not
-    drawn in all yet, which is not judged: no comparison finds it to be less."""
+    """Pixels that each fills in all of its block's views, by BLEND_SUMS; NaN until it was drawn in all."""
     weight, passes = (growth[name] for name in BLEND_SUMS)
     return torch.where(passes >= FULL_PASS, weight / passes, torch.nan)
 
@@ -93,9 +89,8 @@ def faded(growth: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def floaters(growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians are faint and fill more of their block's views than the mean: clouds before cameras, by
-    which the light of single photos is imitated, and which other views look through. Faint are opacities,
-    after the sigmoid, below this and FAINTER of their median."""
+    """Which Gaussians fill more of their block's views than the mean, and have opacities, after the sigmoid,
+    below `faint` and FAINTER of their median: clouds before cameras that imitate the light of photos."""
     full = contributions(growth)
     return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
 
@@ -120,9 +115,8 @@ def veils(
 
 
 def risen(bound: float, progress: float, growth_ends: float) -> float:
-    """What a bound, as `min_contribution`, is at a share of the run. It rises until growth ends: what is new
-    has not found its place. Late in the run it is 0, so that only what fills nothing at all goes: what is
-    missed could not be made good."""
+    """What a bound, as `min_contribution`, is at a share of the run: it rises until growth ends. After LAST
+    it is 0, as what is missed could not be made good."""
     if progress >= LAST:
         return 0.0
     return bound * min(progress / growth_ends, 1.0) if growth_ends > 0 else bound

@@ -1,6 +1,5 @@
 """Blocks that outgrow what the device holds are cut in two when they are persisted."""
 
-from abcd_ns.engine.events import Announcer, BlockSplit
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.space.partition import best_split
 from abcd_ns.engine.space.tree import BlockTree
@@ -20,7 +19,7 @@ def split_full(
     Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
 
     Args:
-        updates: blocks that are about to be persisted; what has a special name is left alone.
+        updates: what is about to be persisted; what has a special name is not cut.
 
     Returns:
         The tree with the cuts, everything to persist, and of each new block the one that it was part of.
@@ -47,8 +46,8 @@ def split_full(
 def _with_full(
     scene: StoredScene, updates: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
-    """What is about to be persisted, and the blocks that are full with those that wait for their visit, but
-    for the busy ones, in training. There might be no room for these in it."""
+    """What is about to be persisted, and blocks that are full with their pending migrants, whose visit might
+    not have room for them; but for the busy ones, in training."""
     pending = updates.get(PENDING)
     if not limits.block_limit or pending is None:
         return updates
@@ -62,25 +61,19 @@ def _with_full(
 
 
 def cut_full(
-    scene: StoredScene,
-    updates: dict[BlockName, BlockState],
-    state: RunState,
-    limits: Limits,
-    announce: Announcer,
-) -> tuple[BlockTree, dict[BlockName, BlockState]]:
-    """Cut blocks that have outgrown their limit, see `split_full`; parts inherit what the run knows of the
-    whole. Gives the tree with the cuts, and everything to persist."""
+    scene: StoredScene, updates: dict[BlockName, BlockState], state: RunState, limits: Limits
+) -> tuple[BlockTree, dict[BlockName, BlockState], dict[int, int]]:
+    """As `split_full`, with pending migrants. Parts inherit what the run knows of the whole."""
     busy = {visit.geometry.block for visit in state.in_flight}
     tree, updates, parents = split_full(scene.tree, _with_full(scene, updates, limits, busy), limits)
     for new, parent in parents.items():
         state.inherit(new, parent)
-        announce(BlockSplit(parent, new))
-    return tree, updates
+    return tree, updates, parents
 
 
 def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
-    """Cut the blocks of a run that resumes with smaller limits than it had. A block among others is cut when
-    the visit that was under way ends, as in the warm-up; that to a block that was the whole scene is over."""
+    """Cut the blocks of a run that resumes with smaller limits than it had. One in training among others is
+    cut when its visit ends; the visit to a block that was the whole scene is over."""
     active = state.active
     for block in range(scene.tree.num_blocks) if limits.block_limit else ():
         in_visit = active is not None and (active.is_whole or active.geometry.block == block)
@@ -95,7 +88,7 @@ def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
             large = {block: found, ACTIVE: found.nobody}
         else:
             large = {block: with_pending(scene, block), **pending_without(scene, {block})}
-        tree, parts = cut_full(scene, large, state, limits, Announcer())
+        tree, parts, _ = cut_full(scene, large, state, limits)
         if tree is not scene.tree:
             state.active = active = None if active is None or active.is_joint else active
             scene.persist(tree, parts, state.to_json())

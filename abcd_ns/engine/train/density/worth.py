@@ -107,8 +107,8 @@ def share_seen(growth: Mapping[str, Tensor]) -> float:
 def worth(
     growth: Mapping[str, Tensor], views: int, pixels: float
 ) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
-    """Squared error that the best split of each would remove in all of the block's views, and the axis to
-    split along; 0 where that is no more than so many average pixels have."""
+    """Squared error that the best split of each would remove in all views, 0 where so many average pixels
+    have as much; and the axis to split along."""
     *halves, _, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1, 1), dim=1)
     sums = [(halves[k].view(-1, BY_AXIS, 3), halves[k + 1][..., None]) for k in (0, 2)]
     gain = torch.zeros_like(sums[0][0])

@@ -118,8 +118,7 @@ class ActiveBlock:
 
     @torch.no_grad()
     def _hold_sizes(self) -> None:
-        """Nothing becomes oversized but what fills much of the block's views. What is so already stays: no
-        step has seen pictures without it."""
+        """Nothing becomes oversized but what fills much of the block's views; what is so already stays."""
         run = self._run
         if not run.health.may_act:
             return

@@ -36,8 +36,8 @@ COMING = 8
 ALIGN = 16
 """Parts meet at multiples of this in the image, pixels: gsplat's tiles are whole then."""
 PLAY = 64
-"""The room in which the lines between parts move from step to step, where parts are larger, pixels. SSIM's
-windows of 11 px are left out where a line crosses them: by columns, and by rows, one time in five at most."""
+"""Pixels by which the lines between parts move from step to step, where parts are larger. SSIM's windows of
+11 px are left out where a line crosses them: by columns, and by rows, one time in five at most."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Residuals:
     def ask(
         self, rendered: Rendered, samples: Sequence[Sample], pictures: Pictures, photos: Pictures
     ) -> None:
-        """Call before the backward pass, with what was rendered of these samples and what the loss compares."""
+        """Call before the backward pass, with what was rendered of these samples and the loss compares."""
         residuals = [photo[..., :3] - picture for picture, photo in zip(pictures, photos, strict=True)]
         for info in (info for info in rendered.infos if "sums" in info):
             own = [place for place, raster in enumerate(rendered.rasters) if raster.info is info]

@@ -4,10 +4,10 @@ RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et al., NeurIPS 2024) and S
 CVPR 2025) leave out a given share of what ranks lowest. Here the pictures say how many: as many as training
 views can spare.
 
-A pixel is linear in each Gaussian's opacity o, so that without the Gaussian it changes by o dC/do. One drawing
-backward tells the sum of its squares over pixels for all Gaussians at once (Hutchinson 1990): with random
-signs as the gradient of the picture, the square of what comes back is that sum in expectation. As a share of
-the view's squared error it is the Gaussian's worth in dB, if it alone went.
+A pixel is linear in each Gaussian's opacity o, so that without the Gaussian it changes by o dC/do. One
+drawing backward tells the sum of its squares over pixels for all Gaussians at once (Hutchinson 1990): with
+random signs as the gradient of the picture, the square of what comes back is that sum in expectation. As a
+share of the view's squared error it is the Gaussian's worth in dB, if it alone went.
 """
 
 import math
@@ -23,11 +23,11 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.commit import pending_without, with_pending
 from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
 from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.layer_source import WholeViews
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.step.batch import Sample, Target, background
-from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
@@ -123,8 +123,8 @@ class FinalPruning:
         return min(free, limit * needs.gaussian_bytes if limit else free) // 3
 
     def _worth(self, scene: BlockScene, views: list[View]) -> list[Float[Tensor, "_n"]]:
-        """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for
-        what shows in none of them, unless they are all."""
+        """By block, what drawn Gaussians are worth, dB of the mean PSNR; infinite for what shows in none of
+        the ranked views, unless they are all."""
         run = self._run
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
@@ -163,8 +163,8 @@ class FinalPruning:
         return float(torch.stack(found).mean())
 
     def _square(self, view: View, picture: Raster) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
-        """The squared error of a picture, summed over the pixels that count, and which these are. It has
-        training's background: on black alone, black things would not be missed."""
+        """The squared error of a picture, summed over the pixels that count, and which these are."""
+        # With training's background: on black alone, black things would not be missed.
         behind = background(self._run.config, view.index, 0).to(picture.color)
         shown = picture.color.detach() + picture.transmittance.detach()[..., None] * behind
         seen, photo, counts = self._whole.beside(view, shown, behind)

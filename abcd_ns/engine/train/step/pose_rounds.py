@@ -10,9 +10,9 @@ from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
+from abcd_ns.engine.train.layer_source import WholeViews
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
-from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.types import View
 
 FIRST = 16.0
