@@ -31,13 +31,14 @@ from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import Influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.train import layer_source, visit_training
+from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import LAYER_SHARE, needs_of
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step import layer_source
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.results.tables import markdown

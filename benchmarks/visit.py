@@ -22,8 +22,8 @@ from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.layer_source import layers_of_visit
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.layer_source import layers_of_visit
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage

@@ -14,8 +14,7 @@ from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.run_state import ActiveVisit, BlockHealth
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 

@@ -31,12 +31,11 @@ from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.commit import commit, with_pending
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import BlocksBusyError
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.run_state import ActiveVisit, BlockHealth
 from abcd_ns.engine.train.step.batch import Rendered, Sample, Target
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.types import Gaussians
 
 SLACK = 2  # visits begun and not yet taken in, for each worker: with 1 all would wait for the slowest

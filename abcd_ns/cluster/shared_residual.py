@@ -20,9 +20,9 @@ from abcd_ns.engine.events import LayersDrawn
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, rounded
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.space.influence import Influence, weights_by_pixel
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 

@@ -22,11 +22,11 @@ from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import Judgement, take_step
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View

@@ -25,11 +25,11 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_stored
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size, limits_at
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError

@@ -9,8 +9,7 @@ from enum import Enum
 from pathlib import Path
 
 from abcd_ns.engine.events import WorkerSeen
-from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS, BlockHealth
-from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.run_state import TOO_FEW_VIEWS, BlockHealth, RunState
 from abcd_ns.engine.train.step.final_pruning import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.units import bytes_in_words

@@ -3,7 +3,8 @@
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.train import layer_source, visit_training
+from abcd_ns.engine.train import visit_training
+from abcd_ns.engine.train.step import layer_source
 from benchmarks import large
 
 

@@ -7,8 +7,8 @@ from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import train
 from tests.cluster.in_process import InProcessWorkers
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene

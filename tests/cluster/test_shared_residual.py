@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from abcd_ns.cluster.shared_residual import FAINT, SharedResidual, shares, shown_beside
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.render import Shot, TorchRasterizer
-from abcd_ns.engine.train.layer_source import LayerRoom
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import train
 from tests.cluster.conftest import setup_of
 from tests.cluster.in_process import InProcessWorkers

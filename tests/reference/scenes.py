@@ -26,10 +26,10 @@ from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Crop, Gaussians, View

@@ -13,7 +13,7 @@ from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import lowered
 from abcd_ns.engine.train.density.pruning import BLEND_SUMS
-from abcd_ns.engine.train.health import LATE_AFTER, wider_than
+from abcd_ns.engine.train.health import LATE_AFTER, widest
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop
 from tests.reference.device_counts import Counts
@@ -85,7 +85,7 @@ def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, 
     gaussians, ring = random_gaussians(5).to(DEVICE), ring_of_views(views)
     growth = {name: torch.ones(5).to(DEVICE) for name in BLEND_SUMS}
     before = counts.copy()
-    wider_than(0.05, gaussians.scales, gaussians.means, ring)
+    widest(gaussians.means, ring)
     assert counts.since(before).copies_to_device == 1
     before = counts.copy()
     lowered(gaussians, growth, ring, gaussians.sh_degree)

@@ -8,8 +8,7 @@ from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
+from abcd_ns.engine.train.run_state import ActiveVisit, BlockHealth, RunState, VisitKind
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer import texts
 from abcd_ns.viewer.texts import BlockRow, Status

@@ -4,7 +4,7 @@ import shlex
 
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder, registered_config
-from abcd_ns.engine.train.health_record import BlockHealth, standing
+from abcd_ns.engine.train.run_state import BlockHealth, standing
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.tables import NOTHING
 from abcd_ns.machine import without_home

@@ -16,12 +16,12 @@ from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.commit import commit
 from abcd_ns.engine.store.special_blocks import ACTIVE, BlockName
 from abcd_ns.engine.train.density.splitting import cut_full
-from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered, Sample, Target
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
+from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
@@ -61,8 +61,7 @@ class Coordinator(Trainer):
         return self.visit.batch
 
     def next_batch(self) -> Batch:
-        """Begin a visit if none is under way, set the learning rates, and say what to train on next; a
-        NothingSeenError if no view sees any block."""
+        """Begin a visit if none is under way; see Trainer. A NothingSeenError if no view sees any block."""
         self.stopwatch.start()
         # Before a step, not after one: a run that stops between two goes on to the same round.
         if self.poses is not None and self.poses.is_due:
@@ -122,8 +121,7 @@ class Coordinator(Trainer):
             self.announce(EpochEnded(self.state.epoch, self.state.step))
 
     def complete(self) -> None:
-        """End a visit that is under way, as where a run resumes for no more steps, and prune for the last
-        time if options and photos allow."""
+        """End a visit that is under way, and prune for the last time if options and photos allow."""
         if self.state.active is not None:
             self.end_visit()
         if self._final_pruning is not None and self.state.pruned_at != self.state.step:

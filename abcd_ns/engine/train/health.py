@@ -21,8 +21,7 @@ from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.commit import state_for_visit
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import WHOLE
-from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
-from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.run_state import ActiveVisit, BlockHealth, HealthByBlock
 from abcd_ns.engine.transfer import StepNumbers, upload
 from abcd_ns.engine.types import Gaussians, View, centers_of
 
@@ -33,8 +32,7 @@ STAND_IN_OPACITY = -9.0
 LARGEST_LOG_SCALE = 40.0
 """A standard deviation of e^40; its square still is a number in float32."""
 OVERSIZED_ANGLE = 0.3
-"""An oversized Gaussian's standard deviation is over this share of its distance to the nearest camera: 3
-sigma cover 45 degrees to either side. What is far away, sky for instance, may be large."""
+"""An oversized Gaussian's standard deviation is over this share of its distance to the nearest camera."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 DISTANCES_AT_ONCE = 1 << 22
@@ -49,23 +47,19 @@ class Health:
     ) -> None:
         self.may_act = may_act
         self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
-        self._active: ActiveVisit | None = None
-        self._health_by_block: HealthByBlock = {}
-        self._attached: Tensor | None = None
-        self._resumed = False
-        self._bad: Tensor | None = None
-        self._shares: list[Tensor] = []
         self._numbers = StepNumbers(params["means"].device)
         self._guard = StepGuard(optimizers) if self._numbers.are_late else None
-        self._clean, self._psnr = LATE_AFTER, math.nan
+        self.begin_visit(None, {})
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
-    def begin_visit(self, active: ActiveVisit, health_by_block: HealthByBlock) -> None:
-        """A block was attached; what is found is added to the run's `health_by_block`."""
+    def begin_visit(self, active: ActiveVisit | None, health_by_block: HealthByBlock) -> None:
+        """A block was attached, if any; what is found is added to the run's `health_by_block`."""
         self._active, self._health_by_block = active, health_by_block
-        self._attached, self._bad, self._shares = self._params["means"], None, []
-        self._resumed = active.saved
+        self._resumed = active is not None and active.saved
+        self._attached = self._params["means"]
+        self._bad: Tensor | None = None
+        self._shares: list[Tensor] = []
         self._clean, self._psnr = LATE_AFTER, math.nan
 
     @torch.no_grad()
@@ -91,15 +85,11 @@ class Health:
     @torch.no_grad()
     def shrink_oversized(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> None:
         """Shrink Gaussians, but for the spared, that are too large for every camera, along the axes that are.
-
-        Photos may agree on such a Gaussian. But it is sorted by its mean: from anywhere else it may come
-        before what it lies behind, and veil half the picture.
-        """
+        Photos may agree on one. But it is sorted by its mean: from elsewhere it may veil half the picture."""
         if not self.may_act:
             return
-        scales = self._params["scales"]
-        over, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
-        over &= ~spared[:, None]
+        scales, allowed = self._params["scales"], widest(self._params["means"], views)
+        over = (scales > allowed) & ~spared[:, None]
         rows = over.any(dim=1).nonzero()[:, 0]
         if len(rows) == 0:
             return
@@ -110,8 +100,7 @@ class Health:
     @torch.no_grad()
     def largest(self, views: Iterable[View], spared: Bool[Tensor, "n"]) -> Float[Tensor, "n 3"]:
         """Logarithms of standard deviations that none but the spared may grow beyond."""
-        scales = self._params["scales"]
-        _, allowed = wider_than(OVERSIZED_ANGLE, scales, self._params["means"], views)
+        scales, allowed = self._params["scales"], widest(self._params["means"], views)
         return torch.maximum(scales, torch.where(spared[:, None], math.inf, allowed)).nan_to_num(math.inf)
 
     def end_visit(self) -> None:
@@ -290,19 +279,15 @@ def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
 
 
 @torch.no_grad()
-def wider_than(
-    angle: float, scales: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], views: Iterable[View]
-) -> tuple[Bool[Tensor, "n 3"], Float[Tensor, "n 1"]]:
-    """Along which axes a standard deviation, of which `scales` are logarithms, is over `angle` times the
-    distance to the nearest camera, and the logarithm of that."""
+def widest(means: Float[Tensor, "n 3"], views: Iterable[View]) -> Float[Tensor, "n 1"]:
+    """Logarithm of the largest standard deviation that is not oversized for the nearest camera."""
     views = tuple(views)
     near = torch.tensor([[view.near] for view in views], dtype=torch.float64)
     cameras = upload(torch.cat((centers_of(views), near), dim=1).to(means.dtype), means.device)
     nearest = means.new_full((len(means),), math.inf)
     for few in cameras.split(max(DISTANCES_AT_ONCE // max(len(means), 1), 1)):
         nearest = torch.minimum(nearest, torch.maximum(_distances(means, few[:, :3]), few[:, 3]).amin(dim=1))
-    allowed = (angle * nearest).log()[:, None]
-    return scales > allowed, allowed
+    return (OVERSIZED_ANGLE * nearest).log()[:, None]
 
 
 def _distances(ours: Float[Tensor, "n 3"], theirs: Float[Tensor, "m 3"]) -> Float[Tensor, "n m"]:

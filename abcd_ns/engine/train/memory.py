@@ -29,8 +29,7 @@ KEPT_FLOATS = 12
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
-"""Of a pixel that is drawn into layers: colour, transmittance, depth and the last of its Gaussians, of two
-layers at once, and these once more while they are rounded."""
+"""Of a pixel that is drawn into layers: colour, transmittance, depth and last Gaussian, of two, twice."""
 LAYER_SHARE = 1 / 8
 """Of the device's budget, for the layers of a visit."""
 PHOTO_SHARE = 1 / 8
@@ -95,8 +94,7 @@ class DeviceNeeds:
         return pixels + LEAST_PASS * frozen + DEVICE_SPLATS * drawn
 
     def frozen_beside(self, active: int) -> int:
-        """Frozen Gaussians that a pass may draw beside so many active ones, whose gradients and drawings have
-        not begun."""
+        """Frozen Gaussians that a pass may draw in the room for gradients and drawings of active ones."""
         free = active * (self.gaussian_bytes - 3 * self.parameter_bytes)
         return free // drawing_bytes(self.sh_degree, self.primitive)
 

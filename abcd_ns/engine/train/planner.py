@@ -11,9 +11,8 @@ from abcd_ns.engine.space.tree import in_float64
 from abcd_ns.engine.space.visibility import ROUNDING, Frusta, Optics
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train import schedule
-from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, VisitKind
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, BlockHealth, VisitKind
 from abcd_ns.engine.train.step.batch import Batch, Pictures
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
@@ -39,8 +38,7 @@ class Visits(ABC):
 
     @abstractmethod
     def begin(self, at_once: int = 1) -> ActiveVisit:
-        """The next visit, which from now on is the run's active one, of so many that are out at once; a
-        NothingSeenError if no view sees any block."""
+        """The next visit, of so many at once, which becomes the run's active one; else a NothingSeenError."""
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
         """Call when the visit's block has become active. Gives what others see of it meanwhile: all of it."""

@@ -28,8 +28,7 @@ class TrainingRun:
     """One training run over a scene, through the caller's parameters and optimizers.
 
     Args:
-        params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
-            learning rates; that of the means is the one to decay from.
+        params, optimizers: as `param_swap` wants them. Only their learning rates are used, to decay from.
         light: each photo's; None for what the options ask for, not found yet.
     """
 

@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -11,12 +11,13 @@ import msgspec
 
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
-from abcd_ns.engine.store.special_blocks import from_text
-from abcd_ns.engine.train.health_record import BlockHealth, HealthByBlock
+from abcd_ns.engine.store.special_blocks import BlockName, from_text
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
 """Steps of a visit that something else ends."""
+TOO_FEW_VIEWS = 2
+"""A block that no more views see has surfaces that nothing but the first Gaussians hold in place."""
 
 
 class VisitKind(str, Enum):
@@ -119,6 +120,31 @@ class ActiveVisit:
 
 
 @dataclass
+class BlockHealth:
+    """Of one block, since the run began: counts, and facts of its last visit."""
+
+    visits: int = 0
+    """That ended."""
+    gradients: int = 0
+    """Rows of gradients that were no numbers and were set to zero. On an accelerator the first steps that
+    have any are skipped, and count as a row each."""
+    moments: int = 0
+    """Rows of Adam's moments likewise."""
+    values: int = 0
+    """Gaussians that were no numbers: put back as they were stored, or replaced by transparent ones."""
+    oversized: int = 0
+    """Gaussians that were shrunk."""
+    pruned: int = 0
+    """Gaussians that filled too little of their views and were taken out."""
+    hidden: bool = False
+    """In the last visit no picture showed the block."""
+
+
+HealthByBlock = dict[BlockName, BlockHealth]
+"""By block; special_blocks.WHOLE for the warm-up. A block that was never visited is missing."""
+
+
+@dataclass
 class RunState:
     """All that the coordinator knows besides the blocks themselves."""
 
@@ -181,6 +207,19 @@ class RunState:
         state = msgspec.convert(data, RunState, str_keys=True)
         state.health = {from_text(block): record for block, record in state.health.items()}
         return state
+
+
+def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -> str:
+    """How a block stands, in a few words, where so many views, see RunState, were worth training it on."""
+    if views.get(block) == 0:
+        return "seen by no view, left as it was"
+    if record is None or record.visits == 0:
+        return "not visited yet"
+    if record.hidden:
+        return "hidden behind others, passed over"
+    if views.get(block, TOO_FEW_VIEWS + 1) <= TOO_FEW_VIEWS:
+        return "seen by 1 view only" if views[block] == 1 else f"seen by {views[block]} views only"
+    return "trained"
 
 
 class Stopwatch:

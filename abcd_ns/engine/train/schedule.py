@@ -42,8 +42,7 @@ class VisitPlan(NamedTuple):
 
 
 def warm_up_is_over(progress: float, uses: float, share: float, deferred: int) -> bool:
-    """Whether the warm-up, with `share` of the run, has used each view often enough; the coarse model has no
-    room for the `deferred` Gaussians."""
+    """Whether the warm-up, with `share` of the run, used each view often enough; `deferred` have no room."""
     if deferred:
         return progress >= share or uses >= COARSE_MODEL_PASSES
     return progress >= share and (uses >= WARM_UP_PASSES or progress >= LONGER * share)

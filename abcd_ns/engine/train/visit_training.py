@@ -16,7 +16,6 @@ from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
-from abcd_ns.engine.train.layer_source import LayerRoom, layers_of_visit
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -31,6 +30,7 @@ from abcd_ns.engine.train.step.batch import (
     Sample,
     part_to_draw,
 )
+from abcd_ns.engine.train.step.layer_source import LayerRoom, layers_of_visit
 
 
 class VisitTraining:

@@ -13,8 +13,7 @@ from rich.text import Text
 
 from abcd_ns.data.input_errors import say
 from abcd_ns.engine import events
-from abcd_ns.engine.train.health_record import HealthByBlock, standing
-from abcd_ns.engine.train.run_state import UNLIMITED
+from abcd_ns.engine.train.run_state import UNLIMITED, HealthByBlock, standing
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words

@@ -25,8 +25,7 @@ from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks
-from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.run_state import BlockHealth, RunState
 from tests.cli.report.runs import (
     TRAINING,
     line,

@@ -7,9 +7,8 @@ from torch.testing import assert_close
 from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
-from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.run_state import BlockHealth, RunState
 from abcd_ns.engine.train.schedule import VisitPlan, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step

@@ -9,10 +9,10 @@ from abcd_ns.engine.events import PrunedAtEnd, Pruning
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.layer_source import WholeViews
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import final_pruning
 from abcd_ns.engine.train.step.final_pruning import FinalPruning, _Probe, random_signs
+from abcd_ns.engine.train.step.layer_source import WholeViews
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene

@@ -10,8 +10,8 @@ from abcd_ns.engine.events import Repaired, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import OVERSIZED_ANGLE, Health, stand_ins, unsound
-from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_room, parameter_bytes
+from abcd_ns.engine.train.run_state import BlockHealth, standing
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.train.capture.poses import laid_over, turned
-from abcd_ns.engine.train.layer_source import layers_of_visit
 from abcd_ns.engine.train.step import pose_rounds
+from abcd_ns.engine.train.step.layer_source import layers_of_visit
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, assert_resumes, random_gaussians, ring_of_views
 

@@ -10,9 +10,8 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.density.splitting import cut_stored, split_full
-from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.recipe import FULL, Limits
-from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.run_state import BlockHealth, RunState, standing
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import GROWING, STILL, assert_resumes, listen, random_gaussians, whole_scene

@@ -12,8 +12,6 @@ from abcd_ns.engine.transfer import finest, upload
 from abcd_ns.errors import UserError
 
 Kind = Literal["none", "exposure", "affine"]
-Gradients = Sequence[tuple[int, Tensor]]
-"""(view, the gradient by its transform) pairs, one for each picture."""
 RATE, DECAY_USES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
 LAST_RATE = 0.03
@@ -53,8 +51,9 @@ class Light:
         return (self._identity + (self._changes[self._rows[view]] - common)).requires_grad_()
 
     @torch.no_grad()
-    def step(self, gradients: Gradients, damping: float = 1.0) -> None:
-        """Take a step of Adam with damped rates for each of these views. What is no number counts as zero."""
+    def step(self, gradients: Sequence[tuple[int, Tensor]], damping: float = 1.0) -> None:
+        """Take a step of Adam with damped rates, by pairs of a view and the gradient by its transform, one
+        for each picture. What is no number counts as zero."""
         if not gradients:
             return
         of_views: dict[int, Tensor] = {}
@@ -115,7 +114,7 @@ class HeldLight:
         """The transform of a view."""
         return self._transforms[view]
 
-    def step(self, gradients: Gradients, damping: float = 1.0) -> None:
+    def step(self, gradients: Sequence[tuple[int, Tensor]], damping: float = 1.0) -> None:
         """Nothing."""
 
 

@@ -21,7 +21,6 @@ APART, NARROWED = 0.8, 0.6
 The squares add up to 1, so that variances agree."""
 LEAST = 1e-6
 """Transmittance of the most opaque, whose optical depth would have no end."""
-WEIGHT = BLEND_SUMS[0]
 
 
 def chosen(wanted: Float[Tensor, "n"], room: int) -> Bool[Tensor, "n"]:
@@ -66,6 +65,7 @@ def split_gaussians(
     # Transmittances multiply, so that optical depths, -log(1 - opacity), add up: 2 NARROWED of each's in all.
     transmits = (1 - opacities).clamp_min(LEAST) ** (1 / (2 * NARROWED))
     params["opacities"][both] = torch.logit(1 - transmits).repeat(2, 1)
-    if WEIGHT in found:
-        found[WEIGHT][both] /= 2
+    weight, _ = BLEND_SUMS
+    if weight in found:
+        found[weight][both] /= 2
     return found

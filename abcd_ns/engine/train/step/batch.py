@@ -27,8 +27,6 @@ Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 """What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
 Pictures = Sequence[Float[Tensor, "_h _w 3"]]
 """One for each sample of a step, 0..1."""
-KEPT = ("weights", "sums")
-"""Of what a drawing tells, what is read after the step."""
 BACKGROUNDS = 1024
 """Steps whose backgrounds a device gets in one copy."""
 COMING = 8
@@ -166,7 +164,8 @@ class Rendered:
     @property
     def kept(self) -> "Rendered":
         """What `Trainer.after_step` reads of it: neither pictures nor what backward goes through."""
-        infos = tuple({name: info[name] for name in KEPT if name in info} for info in self.infos)
+        kept = "weights", "sums"
+        infos = tuple({name: info[name] for name in kept if name in info} for info in self.infos)
         return replace(self, pictures=(), rasters=(), infos=infos)
 
     @staticmethod

@@ -23,11 +23,11 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.commit import pending_without, with_pending
 from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.train.layer_source import WholeViews
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.step.batch import Sample, Target, background
+from abcd_ns.engine.train.step.layer_source import WholeViews
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 

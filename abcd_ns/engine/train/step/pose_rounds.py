@@ -10,9 +10,9 @@ from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
-from abcd_ns.engine.train.layer_source import WholeViews
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.layer_source import WholeViews
 from abcd_ns.engine.types import View
 
 FIRST = 16.0
@@ -25,9 +25,7 @@ EVERY, SHARE = 1.0, 0.04
 
 class PoseRounds:
     """Refines all poses of a run once in a while, each by a picture of the whole scene beside its `target`.
-
-    Never while a visit among others is under way: its layers are drawn from the poses with which it began.
-    """
+    Never while a visit among others is under way, for its layers are drawn from the poses as they were."""
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
