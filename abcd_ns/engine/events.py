@@ -82,7 +82,7 @@ class Repaired:
     block: int | None
     """None for the warm-up, and where all blocks are trained in every step."""
     what: str
-    """The count of health_record.BlockHealth that it is added to."""
+    """The count of BlockHealth that it is added to."""
     count: int
     """Gaussians."""
 

@@ -126,8 +126,8 @@ class DeviceNeeds:
 
 
 def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
-    """Gaussians of the warm-up: where not given, as many as take no more than a visit to the largest of
-    several blocks, which has so many, on images of so many pixels at most."""
+    """Gaussians of the warm-up: if not given, as many as take no more than a visit to one of several blocks
+    with `block` Gaussians, on images of so many pixels at most."""
     visit, warm_up = (needs_of(config, pixels, blocks) for blocks in (2, 1))
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
@@ -135,8 +135,7 @@ def coarse_model_size(config: TrainingConfig, block: int, pixels: int) -> int:
 
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int, sh_degree: int | None = None) -> DeviceNeeds:
-    """What a visit takes, with images of so many pixels at most, in a scene of so many blocks. Their degree
-    is `sh_degree`; None is `growing_degree`."""
+    """What a visit takes in a scene of so many blocks, of degree `sh_degree`; None for `growing_degree`."""
     return needs_of_step(config, pixels, views_per_step(config.batch, blocks), sh_degree)
 
 
@@ -161,9 +160,8 @@ def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
         before, now = (needs_of(config, 0, blocks, degree).gaussian_bytes for degree in (None, sh_degree))
         return limit * before // now
 
-    return replace(
-        limits, sole_limit=at_degree(limits.sole_limit, 1), block_limit=at_degree(limits.block_limit, 2)
-    )
+    sole, block = at_degree(limits.sole_limit, 1), at_degree(limits.block_limit, 2)
+    return replace(limits, sole_limit=sole, block_limit=block)
 
 
 def degree_with_room(config: TrainingConfig, largest: int, blocks: int) -> int:

@@ -46,8 +46,7 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
 def take_step(
     training: Trainer | VisitTraining, optimizers: Optimizers, assess: Callable[[Batch, Rendered], Judgement]
 ) -> None:
-    """Draw a step's parts one after the other, take the gradients of the losses that `assess` finds, and step
-    every optimizer."""
+    """Draw a step's parts one by one, take gradients of the losses that `assess` finds, step optimizers."""
     batch, drawn, errors = training.next_batch(), [], []
     for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)

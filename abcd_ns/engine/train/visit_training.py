@@ -120,9 +120,8 @@ class VisitTraining:
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(errors)
-        infos, judged = rendered.infos, self._residuals.found()
-        if not sound:
-            infos, judged = (), ()
+        judged = self._residuals.found()
+        infos, judged = (rendered.infos, judged) if sound else ((), ())
         clock = self.block.after_step(taken, self.batch, self._visits.room(), infos, judged)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.block.prune()
@@ -156,10 +155,8 @@ class VisitTraining:
         if active.is_whole:
             uses, deferred = active.done * self.batch / len(active.views), run.scene.rows(DEFERRED)
             out_of_time |= schedule.warm_up_is_over(run.progress, uses, run.config.warmup, deferred)
-        clocks = self.block.clocks
-        outgrown = (
-            active.is_joint and clocks.refined == clocks.steps and run.limits.is_full(len(self.block), 1)
-        )
+        grown = active.is_joint and self.block.clocks.refined == self.block.clocks.steps
+        outgrown = grown and run.limits.is_full(len(self.block), blocks=1)
         return active.done >= active.steps or out_of_time or outgrown
 
     def finish(self) -> BlockState:

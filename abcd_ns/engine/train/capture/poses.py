@@ -93,7 +93,7 @@ def robust(residual: Float[Tensor, "h w 3"]) -> tuple[Tensor, Float[Tensor, "h w
 def step_for(
     view: View, picture: Raster, weight: Float[Tensor, "h w 3"], gradient: Float64[Tensor, "6"]
 ) -> Float64[Tensor, "6"]:
-    """A damped step of Gauss and Newton towards less of a robust loss. The gradient is exact; for the matrix,
+    """A damped step of Gauss and Newton towards less of a robust loss. The gradient is exact. For the matrix,
     pixels move as their depth says and bring their colour along (Lucas and Kanade 1981)."""
     flow = _flow(view, picture)
     across, down = _slopes(picture.color)

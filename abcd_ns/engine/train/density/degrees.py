@@ -131,8 +131,8 @@ def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: 
 
 
 def _gram(gaussians: Gaussians, cameras: Float[Tensor, "v 28"], bases: int) -> Float[Tensor, "n b b"]:
-    """Mean products of the harmonics in the directions of views. Each counts as it shows a Gaussian: by the
-    square of its size there, and not at all where it is beside the picture. NaN where none shows it."""
+    """Mean products of the harmonics in the directions of views. Each view counts by the square of a
+    Gaussian's size there, and not at all where it is beside the picture. NaN where none shows it."""
     means, (viewmats, intrinsics, ends) = gaussians.means, cameras.split((16, 9, 3), dim=1)
     viewmats, intrinsics = viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3)
     turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]

@@ -58,8 +58,7 @@ def with_blend_weights(raster: Raster, in_front: Float[Tensor, "h w"] | None, sh
 
 
 def blend_sums(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
-    """What drawings, after backward, add to BLEND_SUMS of a block with so many views, each [n]; {} if nothing
-    was weighed."""
+    """What drawings add to a block's BLEND_SUMS, each [n], after backward; {} if made without weighing."""
     found = [info["weights"].grad for info in infos if "weights" in info]
     if not found or any(weights is None for weights in found):
         return {}

@@ -46,8 +46,7 @@ def split_full(
 def _with_full(
     scene: StoredScene, updates: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
-    """What is about to be persisted, and blocks that are full with their pending migrants, whose visit might
-    not have room for them; but for the busy ones, in training."""
+    """The updates, and blocks that pending migrants make full, but for the busy ones, in training."""
     pending = updates.get(PENDING)
     if not limits.block_limit or pending is None:
         return updates

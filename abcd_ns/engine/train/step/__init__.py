@@ -1,1 +1,1 @@
-"""What a step is given, layers included, the active block that it changes, and whole pictures between steps."""
+"""What a step is given, layers included, the active block that it changes, whole pictures between steps."""
