@@ -38,7 +38,7 @@ class Visits(ABC):
 
     @abstractmethod
     def begin(self, at_once: int = 1) -> ActiveVisit:
-        """The next visit, of so many at once, which becomes the run's active one; else a NothingSeenError."""
+        """The next visit, of `at_once`, now the active one; a NothingSeenError if no view sees any block."""
 
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
         """Call when the visit's block has become active. Gives what others see of it meanwhile: all of it."""

@@ -52,8 +52,8 @@ class Light:
 
     @torch.no_grad()
     def step(self, gradients: Sequence[tuple[int, Tensor]], damping: float = 1.0) -> None:
-        """Take a step of Adam with damped rates, by pairs of a view and the gradient by its transform, one
-        for each picture. What is no number counts as zero."""
+        """Take a step of Adam (Kingma and Ba 2015) with damped rates, by pairs of a view and the gradient by
+        its transform, one for each picture. What is no number counts as zero."""
         if not gradients:
             return
         of_views: dict[int, Tensor] = {}
