@@ -25,7 +25,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
-from abcd_ns.engine.render.residual_sums import SUMS
+from abcd_ns.engine.render.base import SUMS
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.space.visibility import Optics, reaches

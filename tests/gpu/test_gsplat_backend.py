@@ -15,6 +15,7 @@ from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.rasterizer_scenes import (
     as_leaves,
+    drawn,
     gradients,
     probe,
     random_gaussians,
@@ -50,9 +51,9 @@ def test_equals_the_torch_backend(rasterizers, scene, crop, primitive, antialias
     rasterizer = rasterizers[primitive]
     frozen = scene(100, seed=3) if with_frozen else None
     options = {"sh_degree": 3, "crop": crop, "antialiased": antialiased, "frozen": frozen}
-    image, grads = gradients(lambda g: rasterizer(g, view(), **options), scene(300))
+    image, grads = gradients(lambda g: drawn(rasterizer, g, view(), **options), scene(300))
     torch_rasterizer = TorchRasterizer(use_native=False, primitive=primitive)
-    expected, expected_grads = gradients(lambda g: torch_rasterizer(g, view(), **options), scene(300))
+    expected, expected_grads = gradients(lambda g: drawn(torch_rasterizer, g, view(), **options), scene(300))
     # A fragment at the 1/255 threshold may fall on either side: rounding differs, so a few pixels may too.
     difference = (image - expected).abs() / expected.abs().amax()
     assert difference.mean() < 1e-5
@@ -65,7 +66,8 @@ def test_equals_the_torch_backend(rasterizers, scene, crop, primitive, antialias
 def test_sums_of_residuals_and_means2d_gradient(rasterizer, scene, crop):
     infos = []
     for backend in (rasterizer, TorchRasterizer(use_native=False)):
-        raster = backend(
+        raster = drawn(
+            backend,
             as_leaves(scene(200)),
             view(),
             sh_degree=1,
@@ -170,9 +172,9 @@ def test_the_cells_layers_fold_to_the_merged_picture(rasterizer, scene, crop, de
 
 @pytest.mark.parametrize("crop", CROPS)
 def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
-    gaussians, options = scene(100), {"crop": crop or view().full, "visible": 0.02}
-    found = rasterizer.depth_window(gaussians, view(), **options)
-    expected = TorchRasterizer(use_native=False, tile_side=16).depth_window(gaussians, view(), **options)
+    gaussians, seen = scene(100), [(view(), crop or view().full)]
+    backends = rasterizer, TorchRasterizer(use_native=False, tile_side=16)
+    found, expected = (next(backend.depth_windows(gaussians, seen, visible=0.02)) for backend in backends)
     assert found.grid == expected.grid
     for side in ("near", "far"):
         alike = torch.isclose(getattr(found, side), getattr(expected, side), rtol=1e-3)
@@ -184,7 +186,7 @@ def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
 def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(rasterizer, scene, crop, device):
     everyone, crop = thin(scene(300)), crop or view().full
     active, frozen = everyone[torch.arange(100)], everyone[torch.arange(100, 300)]
-    window = rasterizer.depth_window(active, view(), crop=crop, visible=0.0)
+    window = next(rasterizer.depth_windows(active, [(view(), crop)], visible=0.0))
     every = ZWindow.everything(window.grid, device, torch.float32)
     shot = CutShot(view(), crop, every.before(window), window, every.behind(window))
     cuts = []

@@ -5,8 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.render import Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats, camera_numbers, project_in_torch
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 
 
 def random_gaussians(
@@ -41,6 +42,23 @@ def project(gaussians: Gaussians, view: View, sh_degree: int = 0, antialiased: b
     """As the torch rasterizer does, with gradients."""
     camera = camera_numbers(view, gaussians.means, sh_degree, antialiased)
     return Splats(project_in_torch(gaussians, [camera])[0])
+
+
+def drawn(
+    rasterizer: Rasterizer,
+    gaussians: Gaussians,
+    view: View,
+    *,
+    crop: Crop | None = None,
+    frozen: Gaussians | None = None,
+    z_window: ZWindow | None = None,
+    residual_sums: bool = False,
+    **options,
+) -> Raster:
+    """One shot, beside what is frozen or in a window."""
+    seen = None if frozen is None else rasterizer.project(frozen, view, **options)
+    shot = Shot(view, crop or view.full, seen, z_window)
+    return rasterizer.draw(gaussians, [shot], residual_sums=residual_sums, **options)[0]
 
 
 def as_leaves(gaussians: Gaussians) -> Gaussians:

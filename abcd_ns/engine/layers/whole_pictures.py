@@ -26,7 +26,7 @@ from abcd_ns.engine.layers.layer_renderer import (
     drawn_over,
 )
 from abcd_ns.engine.render import Raster
-from abcd_ns.engine.render.together import runs
+from abcd_ns.engine.render.base import runs
 from abcd_ns.engine.types import View
 
 

@@ -4,24 +4,15 @@ from typing import Literal
 
 import torch
 
-from abcd_ns.engine.render.base import CutShot, Raster, Rasterizer, Shot
-from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.projection import PrimitiveName
-from abcd_ns.engine.render.self_check import self_check
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.base import CutShot as CutShot
+from abcd_ns.engine.render.base import Raster as Raster
+from abcd_ns.engine.render.base import Rasterizer as Rasterizer
+from abcd_ns.engine.render.base import Shot as Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer as TorchRasterizer
+from abcd_ns.engine.render.projection import PrimitiveName as PrimitiveName
+from abcd_ns.engine.render.self_check import self_check as self_check
+from abcd_ns.engine.render.z_window import ZWindow as ZWindow
 from abcd_ns.errors import UserError
-
-__all__ = [
-    "CutShot",
-    "PrimitiveName",
-    "Raster",
-    "Rasterizer",
-    "Shot",
-    "TorchRasterizer",
-    "ZWindow",
-    "make_rasterizer",
-    "self_check",
-]
 
 WITHOUT_GSPLAT = ("cpu", "mps")
 """Types of devices."""

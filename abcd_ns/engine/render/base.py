@@ -1,9 +1,9 @@
 """What every rasterizer takes and gives."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +12,12 @@ from torch import Tensor
 from abcd_ns.engine.render.projection import Primitive, Splats, extents_of
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+
+Item = TypeVar("Item")
+DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
+"""Of the views that an accelerator draws together, at most, unless a single view has more."""
+SUMS = 10
+"""Of a Gaussian in a picture, see ResidualSums."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,47 @@ class Cut:
     """Which of the Gaussians they are."""
 
 
+class ResidualSums:
+    """For each Gaussian of a drawing the sums over pixels of w f, w r, w r x and w r y.
+
+    There w = alpha T is its weight, r the residual by channel, f how much the pixel counts, and (x, y) the
+    pixel's middle less the Gaussian's, px.
+
+    Args:
+        find: values for residuals, apart from the drawing's gradients; None where its backward pass finds
+            both at once.
+    """
+
+    def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]] | None = None) -> None:
+        self.values: Float[Tensor, "v n 10"] | None = None
+        """After the drawing's backward pass; None where nobody has asked."""
+        self.asked: list[Tensor] | None = None
+        """The residuals that the backward pass is to sum up."""
+        self._find = find  # which holds on to all that was drawn
+
+    def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
+        """Call before the backward pass, with r and then f of each picture."""
+        if self._find is None:
+            self.asked = [residual.contiguous() for residual in residuals]
+        else:
+            self.values, self._find = self._find(residuals), None
+
+
+def moments(residual: Float[Tensor, "h w 4"], crop: Crop) -> Float[Tensor, "h w 10"]:
+    """f, r, r x and r y of each pixel, with x and y in the image."""
+    r, f = residual[..., :3], residual[..., 3:]
+    x = torch.arange(crop.width, device=r.device, dtype=r.dtype)[:, None] + (crop.x + 0.5)
+    y = torch.arange(crop.height, device=r.device, dtype=r.dtype)[:, None, None] + (crop.y + 0.5)
+    return torch.cat((f, r, r * x, r * y), dim=-1)
+
+
+def about(sums: Float[Tensor, "*n 10"], middle: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 10"]:
+    """Sums of `moments`, with x and y counted from the Gaussians' middles."""
+    f, r, x, y = sums.split((1, 3, 3, 3), dim=-1)
+    middle = torch.where(f == 0, 0.0, middle)  # gsplat gives none of who is not drawn
+    return torch.cat((f, r, x - middle[..., :1] * r, y - middle[..., 1:] * r), dim=-1)
+
+
 class Rasterizer:
     """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera; backends derive from it.
 
@@ -149,25 +196,10 @@ class Rasterizer:
         """
 
     def __call__(
-        self,
-        gaussians: Gaussians,
-        view: View,
-        *,
-        sh_degree: int,
-        crop: Crop | None = None,
-        frozen: Gaussians | None = None,
-        z_window: ZWindow | None = None,
-        antialiased: bool = False,
-        residual_sums: bool = False,
+        self, gaussians: Gaussians, view: View, *, crop: Crop | None = None, **options: Any
     ) -> Raster:
-        """`draw` for a single view and, without `crop`, all of its image."""
-        crop = crop or view.full
-        seen = None
-        if frozen is not None:
-            seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
-        shot = Shot(view, crop, seen, z_window)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased, "residual_sums": residual_sums}
-        return self.draw(gaussians, [shot], **options)[0]
+        """`draw`, with its options, for a single view and, without `crop`, all of its image."""
+        return self.draw(gaussians, [Shot(view, crop or view.full)], **options)[0]
 
     def cuts(
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
@@ -186,10 +218,34 @@ class Rasterizer:
         """For each crop the range of camera z, in each of its tiles, in which the Gaussians show, with
         nothing else in the scene; no gradients. See z_window.showing."""
 
-    def depth_window(
-        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> ZWindow:
-        """`depth_windows` for a single crop."""
-        options = {"visible": visible, "antialiased": antialiased}
-        (window,) = self.depth_windows(gaussians, [(view, crop)], **options)
-        return window
+
+def runs(
+    items: Sequence[Item],
+    crops: Sequence[Crop],
+    pixels: int,
+    *,
+    gaussians: int = 0,
+    splats: int = 0,
+    padded: bool = False,
+) -> Iterator[list[Item]]:
+    """The items, a crop each, in runs of neighbours.
+
+    Args:
+        pixels: most of a run of more than one.
+        gaussians: that are drawn in each crop, if they are limited, too.
+        splats: most of these in all crops of a run of more than one.
+        padded: each crop is drawn as large as the largest of its run.
+    """
+    run: list[Item] = []
+    taken: list[Crop] = []
+    for item, crop in zip(items, crops, strict=True):
+        taken.append(crop)
+        drawn = sum(each.pixels for each in taken)
+        if padded:
+            drawn = len(taken) * max(each.width for each in taken) * max(each.height for each in taken)
+        if run and (drawn > pixels or (len(run) + 1) * gaussians > splats):
+            yield run
+            run, taken = [], [crop]
+        run.append(item)
+    if run:
+        yield run

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Rasterizer, Shot
-from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, runs
+from abcd_ns.engine.render.base import DEVICE_PIXELS, DEVICE_SPLATS, runs
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Gaussians, View
 

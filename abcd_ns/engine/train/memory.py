@@ -12,8 +12,8 @@ import torch
 
 from abcd_ns.engine.gaussians.spherical_harmonics import NUMBERS_WITHOUT_COLOR
 from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, LEAST_PASS, PARTS_BYTES
+from abcd_ns.engine.render.base import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName
-from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import FULL, Limits
 from abcd_ns.engine.train.schedule import views_per_step

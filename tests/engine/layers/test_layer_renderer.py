@@ -14,7 +14,7 @@ from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer, View
-from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error
+from tests.reference.rasterizer_scenes import as_leaves, drawn, probe, relative_error
 from tests.reference.scenes import cell_windows, random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
@@ -106,8 +106,8 @@ def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(primiti
 
     def folded(leaves: Gaussians) -> Layer:
         windows = cell_windows(tree, view, draw.window_grid(view.full), [tree.node_of(b) for b in range(5)])
-        drawn = {b: draw(leaves, view, sh_degree=1, z_window=window) for b, window in enumerate(windows)}
-        return fold([drawn[block].layer for block in front_to_back(tree, view.center)])
+        parts = {b: drawn(draw, leaves, view, sh_degree=1, z_window=w) for b, w in enumerate(windows)}
+        return fold([parts[block].layer for block in front_to_back(tree, view.center)])
 
     found = gradients_of(folded)
     expected = gradients_of(lambda leaves: draw(leaves, view, sh_degree=1).layer)
@@ -148,7 +148,7 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
     for view in views:
         windows = [
             ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
-            draw.depth_window(own, view, crop=view.full, visible=0.05),
+            next(draw.depth_windows(own, [(view, view.full)], visible=0.05)),
         ]
         for window in windows:
             seen = Seen(view, view.full, window)

@@ -19,6 +19,7 @@ from abcd_ns.machine import threads_wanted
 from tests.reference.rasterizer_scenes import (
     as_leaves,
     assert_drawn_alike,
+    drawn,
     gradients,
     probe,
     random_gaussians,
@@ -63,7 +64,7 @@ def test_pictures_and_gradients_are_those_of_torch(primitive, antialiased, sh_de
     frozen = random_gaussians(40, seed=7, dtype=torch.float32)
     for crop in CROPS:
         options = {"sh_degree": sh_degree, "crop": crop, "antialiased": antialiased, "frozen": frozen}
-        draws = (partial(draw, view=VIEW, **options) for draw in pair(primitive))
+        draws = (partial(drawn, draw, view=VIEW, **options) for draw in pair(primitive))
         assert_drawn_alike(*draws, SCENE, *TOLERANCES[primitive])
 
 
@@ -113,9 +114,9 @@ def test_windows_cuts_and_median_depths_are_those_of_torch(primitive):
     # Lists of torch hold what fast ones leave out for leaving no fragment.
     assert set(one.kept_ids.tolist()) <= set(other.kept_ids.tolist())
     assert torch.equal(one.inside.planes, fast.project(SCENE, VIEW, sh_degree=2)[one.kept_ids].planes)
-    masked = [draw(SCENE, VIEW, crop=crop, z_window=window, sh_degree=0) for draw in (fast, slow)]
+    masked = [drawn(draw, SCENE, VIEW, crop=crop, z_window=window, sh_degree=0) for draw in (fast, slow)]
     assert relative_error(*map(stacked, masked)) < picture
-    one, other = (draw.depth_window(SCENE, VIEW, crop=crop, visible=0.05) for draw in (fast, slow))
+    one, other = (next(draw.depth_windows(SCENE, [(VIEW, crop)], visible=0.05)) for draw in (fast, slow))
     for difference in (one.near - other.near, one.far - other.far):
         assert float((difference.abs() > 1e-4).float().mean()) < 0.02  # a weight may fall to either side
     nothing = torch.ones(61, 83), torch.zeros(61, 83)

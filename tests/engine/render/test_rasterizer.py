@@ -17,6 +17,7 @@ from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
     as_leaves,
     assert_drawn_alike,
+    drawn,
     gradients,
     probe,
     random_gaussians,
@@ -65,7 +66,7 @@ def test_equals_the_naive_twin(draw, sh_degree, antialiased, crop, with_frozen, 
     def naive(g):
         return naive_rasterize(g, VIEW, near=near, far=far, primitive=draw.primitive.name, **options)
 
-    found = partial(draw, view=VIEW, z_window=window, **options)
+    found = partial(drawn, draw, view=VIEW, z_window=window, **options)
     assert_drawn_alike(found, naive, gaussians, 1e-11, 1e-10)
 
 
@@ -154,7 +155,7 @@ def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
     weights = probe(VIEW.height, VIEW.width)
     (expected,) = torch.autograd.grad((stacked(naive) * weights).sum(), naive.means2d)
 
-    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen)
+    raster = drawn(EAGER, as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen)
     info = raster.info
     info["means2d"].retain_grad()
     (stacked(raster) * weights).sum().backward()
@@ -168,7 +169,7 @@ def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
 def test_no_gaussians(with_frozen):
     nothing = as_leaves(Gaussians.empty(dtype=torch.float64))
     frozen = random_gaussians(5) if with_frozen else None
-    raster = EAGER(nothing, VIEW, sh_degree=3, frozen=frozen)
+    raster = drawn(EAGER, nothing, VIEW, sh_degree=3, frozen=frozen)
     raster.info["means2d"].retain_grad()
     stacked(raster).sum().backward()
     assert raster.info["means2d"].grad.shape == (1, 0, 2)
@@ -217,7 +218,7 @@ def test_clear_errors():
         EAGER(gaussians, VIEW, sh_degree=2)
     for grid in (TileGrid(CROP, 4), TileGrid(VIEW.full, 2)):
         with pytest.raises(ValueError, match="a window on"):
-            EAGER(gaussians, VIEW, sh_degree=0, z_window=window_for(grid))
+            drawn(EAGER, gaussians, VIEW, sh_degree=0, z_window=window_for(grid))
     with pytest.raises(ValueError, match="CUDA device"):
         make_rasterizer("gsplat", "cpu")
     assert make_rasterizer("auto", "cpu").name == EAGER.name

@@ -202,7 +202,7 @@ def test_depth_windows_and_cuts_of_several_views_are_the_torch_backends(backend)
 def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
     """A block whose last Gaussian was pruned is drawn until its visit ends."""
     nobody = Gaussians.empty(1, dtype=torch.float64)
-    window = backend.depth_window(nobody, VIEW, crop=Crop(16, 0, 32, 20), visible=0.06)
+    window = next(backend.depth_windows(nobody, [(VIEW, Crop(16, 0, 32, 20))], visible=0.06))
     assert bool((window.near == window.far).all())
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2

@@ -15,6 +15,7 @@ from abcd_ns.engine.train.run_state import BlockHealth, Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
+from tests.reference.rasterizer_scenes import drawn
 from tests.reference.scenes import (
     GROWING,
     STILL,
@@ -92,7 +93,7 @@ def gradient_of_whole_picture(coordinator, sample, weights, ownership) -> dict[s
     active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
     if ownership == "fragments":
         others = Gaussians.cat([g for b, g in blocks.items() if b != block])
-        layer = draw(active, sample.view, frozen=others, **options).layer
+        layer = drawn(draw, active, sample.view, frozen=others, **options).layer
     else:
         parts = {**blocks, block: active}
         order = front_to_back(tree, sample.view.center)

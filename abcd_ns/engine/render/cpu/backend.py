@@ -9,7 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels import library
 from abcd_ns.engine.kernels.native import suits
-from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.base import Cut, CutShot, Item, Raster, Rasterizer, Shot, runs
 from abcd_ns.engine.render.cpu import native, reference
 from abcd_ns.engine.render.projection import (
     PRIMITIVES,
@@ -20,7 +20,6 @@ from abcd_ns.engine.render.projection import (
     project_in_torch,
 )
 from abcd_ns.engine.render.splat_kernels import DEPTH
-from abcd_ns.engine.render.together import Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 

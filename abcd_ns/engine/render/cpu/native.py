@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.native import address, library
+from abcd_ns.engine.render.base import SUMS, ResidualSums
 from abcd_ns.engine.render.projection import Primitive
-from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow, window_between
 from abcd_ns.engine.types import Crop, Gaussians
 

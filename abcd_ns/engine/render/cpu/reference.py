@@ -15,9 +15,9 @@ from torch.utils.checkpoint import checkpoint
 
 from abcd_ns.engine.render import splat_kernels as splat
 from abcd_ns.engine.render import surfel_kernels as surfel
+from abcd_ns.engine.render.base import SUMS, ResidualSums, about, moments
 from abcd_ns.engine.render.cpu.native import Part, Pictures, Windows
 from abcd_ns.engine.render.projection import Primitive
-from abcd_ns.engine.render.residual_sums import SUMS, ResidualSums, about, moments
 from abcd_ns.engine.render.splat_kernels import DEPTH, GSPLAT_TILE, MIN_ALPHA, REACH_MARGIN, X, Y
 from abcd_ns.engine.render.z_window import TileGrid, ends_of, showing
 from abcd_ns.engine.transfer import finest

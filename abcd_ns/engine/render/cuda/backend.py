@@ -13,14 +13,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.base import (
+    DEVICE_PIXELS,
+    DEVICE_SPLATS,
+    Cut,
+    CutShot,
+    Item,
+    Raster,
+    Rasterizer,
+    ResidualSums,
+    Shot,
+    runs,
+)
 from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.kinds import kind_of
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
 from abcd_ns.engine.render.cuda.projection import place_on_screen, project
 from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName, Splats, extents_of
-from abcd_ns.engine.render.residual_sums import ResidualSums
-from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
 

@@ -15,11 +15,11 @@ from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
+from abcd_ns.engine.render.base import SUMS, about, moments
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Projected, corners, numbers
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.render.residual_sums import SUMS, about, moments
 from abcd_ns.engine.render.splat_kernels import GSPLAT_TILE as TILE
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow, ends_of, showing
 from abcd_ns.engine.types import Crop, Layer

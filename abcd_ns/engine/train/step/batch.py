@@ -14,9 +14,8 @@ from torch import Tensor
 from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
-from abcd_ns.engine.render.base import Frame
+from abcd_ns.engine.render.base import Frame, ResidualSums
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
-from abcd_ns.engine.render.residual_sums import ResidualSums
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.worth import Judged
