@@ -92,11 +92,8 @@ class ResidualSums:
     """For each Gaussian of a drawing the sums over pixels of w f, w r, w r x and w r y.
 
     There w = alpha T is its weight, r the residual by channel, f how much the pixel counts, and (x, y) the
-    pixel's middle less the Gaussian's, px.
-
-    Args:
-        find: values for residuals, apart from the drawing's gradients; None where its backward pass finds
-            both at once.
+    pixel's middle less the Gaussian's, px. `find` gives them for residuals, or is None where they come
+    with the drawing's gradients.
     """
 
     def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]] | None = None) -> None:
@@ -222,10 +219,10 @@ class Rasterizer:
 def runs(
     items: Sequence[Item],
     crops: Sequence[Crop],
-    pixels: int,
+    pixels: int = DEVICE_PIXELS,
     *,
     gaussians: int = 0,
-    splats: int = 0,
+    splats: int = DEVICE_SPLATS,
     padded: bool = False,
 ) -> Iterator[list[Item]]:
     """The items, a crop each, in runs of neighbours.

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Rasterizer, Shot
-from abcd_ns.engine.render.base import DEVICE_PIXELS, DEVICE_SPLATS, runs
+from abcd_ns.engine.render.base import DEVICE_SPLATS, runs
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Gaussians, View
 
@@ -108,7 +108,7 @@ def in_passes(gaussians: Gaussians, small: Sequence[View]) -> Iterator[list[Shot
     splats = AT_ONCE if gaussians.device.type == "cpu" else DEVICE_SPLATS
     shots = [Shot(view, view.full) for view in small]
     crops = [shot.crop for shot in shots]
-    return runs(shots, crops, DEVICE_PIXELS, gaussians=len(gaussians), splats=splats, padded=True)
+    return runs(shots, crops, gaussians=len(gaussians), splats=splats, padded=True)
 
 
 class InfluenceTable:

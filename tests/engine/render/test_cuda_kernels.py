@@ -57,7 +57,7 @@ for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
 """
 GAUSSIANS = """
 import torch
-from abcd_ns.engine.render.cuda.by_gaussian import shade, skips
+from abcd_ns.engine.render.cuda.by_row import shade, skips
 from tests.reference import triton_stand_ins as twins
 
 generator = torch.Generator().manual_seed(0)
@@ -78,7 +78,7 @@ for wrong in (None, torch.nan, torch.inf):
 """
 WINDOWS = """
 import torch
-from abcd_ns.engine.render.cuda.windowed import windowed
+from abcd_ns.engine.render.cuda.by_row import windowed
 from tests.reference import triton_stand_ins as twins
 
 generator = torch.Generator().manual_seed(0)

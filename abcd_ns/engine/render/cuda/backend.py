@@ -13,22 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.base import (
-    DEVICE_PIXELS,
-    DEVICE_SPLATS,
-    Cut,
-    CutShot,
-    Item,
-    Raster,
-    Rasterizer,
-    ResidualSums,
-    Shot,
-    runs,
-)
+from abcd_ns.engine.render.base import Cut, CutShot, Item, Raster, Rasterizer, ResidualSums, Shot, runs
 from abcd_ns.engine.render.cuda.drawn import Drawn
-from abcd_ns.engine.render.cuda.kinds import kind_of
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
-from abcd_ns.engine.render.cuda.projection import place_on_screen, project
+from abcd_ns.engine.render.cuda.projection import kind_of, place_on_screen, project
 from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName, Splats, extents_of
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -130,9 +118,7 @@ class GsplatRasterizer(Rasterizer):
         residual_sums: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
-        frozen = [
-            (k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen is not None and len(shot.frozen)
-        ]
+        frozen = [(k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen]
         own = project(self._kind, gaussians, views, sh_degree, antialiased, blend_weights)
         info: dict[str, Any] = {"means2d": own.centers, "radii": own.radii}
         info |= {"weights": own.weights} if blend_weights else {}
@@ -155,11 +141,10 @@ class GsplatRasterizer(Rasterizer):
 def _a_few(
     items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
 ) -> Iterator[list[Item]]:
-    limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS, "padded": True}
     pairs = zip(items, seen, strict=True)
     for _, alike in groupby(pairs, lambda pair: _size(pair[1][0])):
         own, seen_by = zip(*alike, strict=True)
-        yield from runs(own, [crop for _, crop in seen_by], DEVICE_PIXELS, **limits)
+        yield from runs(own, [crop for _, crop in seen_by], gaussians=len(gaussians), padded=True)
 
 
 def _size(view: View) -> tuple[int, int, float]:

@@ -77,12 +77,8 @@ def between(
     shown: Sequence[Shown],
     gradients: Sequence[Float[Tensor, "_h _w 3"]] | None = None,
 ) -> list[Tensor]:
-    """One picture for each camera; where gradients of these are given, those by features and alphas.
-
-    Args:
-        shown: of each camera; a layer's channels lie side by side. The gradient by the depth is the weight
-            that a pixel has by its frame.
-    """
+    """One picture for each camera; where gradients of these are given, those by features and alphas. The
+    gradient by the depth is the weight that a pixel has by its frame."""
     _, rows, cols, _ = features.shape
     features, alphas = features.contiguous(), alphas.contiguous()
     sizes = [(down.stop - down.start, across.stop - across.start) for (down, across), _ in shown]
@@ -95,8 +91,7 @@ def between(
     for camera, ((down, across), frame) in enumerate(shown):
         layers, strides = [features] * 4, [0] * 8
         if frame.front is not None:
-            pairs = ((layer.color, layer.transmittance) for layer in (frame.front, frame.back))
-            layers = [value for pair in pairs for value in pair]
+            layers = [v for layer in (frame.front, frame.back) for v in (layer.color, layer.transmittance)]
             layers = [
                 value if value.stride(-1) == 1 or value.ndim == 2 else value.contiguous() for value in layers
             ]

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.base import SUMS, about, moments
 from abcd_ns.engine.render.cuda import fused
-from abcd_ns.engine.render.cuda.kinds import Kind
-from abcd_ns.engine.render.cuda.projection import Projected, corners, numbers
+from abcd_ns.engine.render.cuda.projection import Kind, Projected, corners, numbers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.splat_kernels import GSPLAT_TILE as TILE
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow, ends_of, showing
@@ -30,7 +29,7 @@ LAST_DEPTH = 0x7FFFFFFF
 
 @dataclass(frozen=True)
 class FlatSplats:
-    """m splats of several cameras in one list; pixels of the full images."""
+    """m splats of several cameras in one list; pixels of the full images, or of what is drawn of each."""
 
     cameras: Int64[Tensor, "m"]
     radii: Int[Tensor, "m"]
@@ -47,11 +46,8 @@ class FlatSplats:
     def of(
         own: Projected, frozen: Sequence[tuple[int, Splats]] = (), blend_weights: bool = False
     ) -> "FlatSplats":
-        """Camera by camera; then what is frozen, as (camera, what it sees) pairs.
-
-        Args:
-            blend_weights: as `own` was projected, with zeros for the depths that are composited.
-        """
+        """Camera by camera; then what is frozen, as (camera, what it sees) pairs. `blend_weights` is as for
+        `project`: zeros for the depths that are composited."""
         count, n = own.radii.shape
         cameras = numbers(count, n, own.radii.device)
         names = ("radii", "means2d", "depths", "shapes", "opacities", "features")
@@ -97,15 +93,6 @@ class TileLayout:
         """(cameras, rows, columns) of tiles."""
         rows = max(grid.rows for grid in self.grids) + self.spare
         return len(self.crops), rows, max(grid.cols for grid in self.grids)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of what is drawn of each crop, px.
-
-        Whole tiles: of a masked one gsplat's kernel lets the threads go that have a pixel in the picture, and
-        the others would read the whole list.
-        """
-        return self.shape[2] * TILE, (self.shape[1] - self.spare) * TILE
 
     @property
     def bits(self) -> int:
@@ -162,10 +149,7 @@ class Drawing:
 
     kind: Kind
     splats: FlatSplats
-    means2d: Float[Tensor, "m 2"]
-    """Relative to the upper left tile of each splat's crop."""
-    shapes: Float[Tensor, "m s"]
-    """Likewise."""
+    """Relative to the upper left tile of each one's crop."""
     layout: TileLayout
     isect_ids: Int64[Tensor, "q"]
     """Sorted: camera, tile, bits of the depth."""
@@ -179,28 +163,16 @@ class Drawing:
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
         by = corners(layout.tiled, splats.means2d)
         by = by if len(crops) == 1 else by.index_select(0, splats.cameras)
-        means2d, shapes = splats.means2d - by, kind.moved(splats.shapes, by)
+        splats = replace(splats, means2d=splats.means2d - by, shapes=kind.moved(splats.shapes, by))
         if len(splats) == 0:
-            return Drawing(kind, splats, means2d, shapes, layout, splats.cameras, splats.cameras.int())
+            return Drawing(kind, splats, layout, splats.cameras, splats.cameras.int())
         _, rows, cols = layout.shape
+        ids = {"camera_ids": splats.cameras, "gaussian_ids": splats.cameras}  # the latter are not read
+        options = {"packed": True, "n_cameras": len(crops), **ids}
         _, isect_ids, flatten_ids = isect_tiles(
-            means2d,
-            splats.radii,
-            splats.depths,
-            TILE,
-            cols,
-            rows,
-            packed=True,
-            n_cameras=len(crops),
-            camera_ids=splats.cameras,
-            gaussian_ids=splats.cameras,  # asked for, and not read
+            splats.means2d, splats.radii, splats.depths, TILE, cols, rows, **options
         )
-        return Drawing(kind, splats, means2d, shapes, layout, isect_ids, flatten_ids)
-
-    @property
-    def tile(self) -> Int64[Tensor, "q"]:
-        """Number of each pair's tile among those of all cameras."""
-        return self.layout.tile(self.isect_ids)
+        return Drawing(kind, splats, layout, isect_ids, flatten_ids)
 
     @property
     def z(self) -> Float[Tensor, "q"]:
@@ -210,24 +182,20 @@ class Drawing:
     def inside(self, windows: Sequence[ZWindow | None], always: int = 0) -> Bool[Tensor, "q"]:
         """Which pairs lie within their tile's window; those of the first `always` splats do."""
         near, far = self.layout.spread(windows, self.splats.depths)
-        tile, z = self.tile, self.z
+        tile, z = self.layout.tile(self.isect_ids), self.z
         inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
         return inside | (self.flatten_ids < always) if always else inside
 
     def windowed(self, windows: Sequence[ZWindow | None], always: int = 0) -> "Drawing":
-        """Only what `inside` finds."""
+        """Only what `inside` finds: that moves up, in order, and the end of the lists belongs to the last
+        tile, a spare one. So the host need not know how many there are."""
         near, far = self.layout.spread(windows, self.splats.depths)
         _, rows, cols = self.layout.shape
         layout = self.layout.bits, rows * cols, self.layout.last_key
         found = fused.windowed(near, far, self.isect_ids, self.flatten_ids, always, *layout)
-        if found is None:
-            return self.only(self.inside(windows, always))
-        return replace(self, isect_ids=found[0], flatten_ids=found[1])
-
-    def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
-        """Without some pairs. The others move up, in order, and the end of the lists belongs to the last
-        tile, a spare one: the host need not know how many there are.
-        """
+        if found is not None:
+            return replace(self, isect_ids=found[0], flatten_ids=found[1])
+        keep = self.inside(windows, always)
         count = len(keep)
         place = torch.where(keep, keep.cumsum(0) - 1, count)  # the others: to one place, which is cut off
         isect_ids = self.isect_ids.new_full((count + 1,), self.layout.last_key)
@@ -247,8 +215,7 @@ class Drawing:
 
     def rasterized(self) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"]]:
         """Features and alphas of the whole sheet."""
-        splats = self.splats
-        return self._rasterize(self.means2d, self.shapes, splats.features, splats.opacities, self.flatten_ids)
+        return self._rasterize(self._outlines, self.splats.features, self.flatten_ids)
 
     def layers(self) -> list[Layer]:
         """What each crop looks like."""
@@ -263,27 +230,24 @@ class Drawing:
         """Where the splats show in each crop; see z_window.showing."""
         _, rows, cols = self.layout.shape
         pixels, found = self.layout.pixels(self.isect_ids.device), []
-        near, far = showing(pixels, self.tile, self.z, self.weights(), visible)
+        tile = self.layout.tile(self.isect_ids)
+        near, far = showing(pixels, tile, self.z, self.weights(), visible)
         for k, grid in enumerate(self.layout.grids):
             sides = (side[k].view(rows, cols)[: grid.rows, : grid.cols].flatten() for side in (near, far))
             found.append(ZWindow(grid, *sides))
         return found
 
     def weights(self) -> Float[Tensor, "q"]:
-        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in its crop.
-
-        Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
-        colour, of which one channel will do, is its weight.
-        """
+        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in its crop: the
+        gradient of the picture's sum by one channel of a colour that each pair has for itself."""
         count = len(self.flatten_ids)
         if count == 0:
             return self.z
-        parts = (self.means2d, self.shapes, self.splats.opacities)
-        means2d, shapes, opacities = (part.index_select(0, self.flatten_ids) for part in parts)
-        dark = means2d.new_zeros((count, 1)).requires_grad_()
+        outlines = [values.index_select(0, self.flatten_ids) for values in self._outlines]
+        dark = outlines[0].new_zeros((count, 1)).requires_grad_()
         each = torch.arange(count, device=dark.device, dtype=self.flatten_ids.dtype)
         with torch.enable_grad():
-            picture, _ = self._rasterize(means2d, shapes, dark, opacities, each)
+            picture, _ = self._rasterize(outlines, dark, each)
             shown = [one[part].sum() for one, part in zip(picture, self.parts, strict=True)]
             (found,) = torch.autograd.grad(torch.stack(shown).sum(), dark)
         return found[:, 0]
@@ -292,45 +256,38 @@ class Drawing:
         self, middles: Float[Tensor, "c n 2"], residuals: Sequence[Float[Tensor, "_h _w 4"]]
     ) -> Float[Tensor, "c n 10"]:
         """See ResidualSums: gradients by features, which stand for them, of the first splats, c n in all.
-
-        Args:
-            middles: of these on screen, px of the images.
-        """
-        parts = (self.means2d, self.shapes, self.splats.opacities)
-        means2d, shapes, opacities = (part.detach() for part in parts)
+        Their `middles` are px of the images."""
+        outlines = [values.detach() for values in self._outlines]
         asked, found = [moments(*pair) for pair in zip(residuals, self.layout.crops, strict=True)], []
         for channels in (slice(0, 4), slice(4, 7), slice(7, SUMS)):  # a few at a time, for the memory
-            dark = means2d.new_zeros((len(means2d), channels.stop - channels.start)).requires_grad_()
+            shape = len(self.splats), channels.stop - channels.start
+            dark = outlines[0].new_zeros(shape).requires_grad_()
             with torch.enable_grad():
-                pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.flatten_ids)
+                pictures, _ = self._rasterize(outlines, dark, self.flatten_ids)
             upstream = torch.zeros_like(pictures)
             for one, part, wanted in zip(upstream, self.parts, asked, strict=True):
                 one[part] = wanted[..., channels]
             found.append(torch.autograd.grad(pictures, dark, upstream)[0][: middles[..., 0].numel()])
         return about(torch.cat(found, dim=1).view(*middles.shape[:2], SUMS), middles)
 
+    @property
+    def _outlines(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.splats.means2d, self.splats.shapes, self.splats.opacities
+
     def _rasterize(
-        self,
-        means2d: Float[Tensor, "p 2"],
-        shapes: Float[Tensor, "p s"],
-        features: Float[Tensor, "p f"],
-        opacities: Float[Tensor, "p"],
-        flatten_ids: Int[Tensor, "q"],
+        self, outlines: Sequence[Tensor], features: Float[Tensor, "p f"], flatten_ids: Int[Tensor, "q"]
     ) -> tuple[Tensor, Tensor]:
+        """Features and alphas of splats with these means2d [p, 2], shapes [p, s] and opacities [p]."""
+        means2d, shapes, opacities = outlines
         cameras, rows, cols = self.layout.shape
-        return self.kind.draw(
-            means2d,
-            shapes,
-            features,
-            opacities,
-            *self.layout.size,
-            TILE,
-            isect_offset_encode(self.isect_ids, cameras, cols, rows),
-            flatten_ids,
-            # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
-            masks=self.layout.drawn(means2d.device),
-            packed=True,
-        )
+        # Whole tiles: of a masked one gsplat's kernel lets the threads go that have a pixel in the picture,
+        # and the others would read the whole list.
+        size = cols * TILE, (rows - self.layout.spare) * TILE, TILE
+        lists = isect_offset_encode(self.isect_ids, cameras, cols, rows), flatten_ids
+        # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
+        masks = self.layout.drawn(means2d.device)
+        given = means2d, shapes, features, opacities, *size, *lists
+        return self.kind.draw(*given, masks=masks, packed=True)
 
     @property
     def parts(self) -> list[tuple[slice, slice]]:

@@ -1,8 +1,7 @@
 """L1 and SSIM with their gradient on CUDA, in four Triton kernels.
 
-As in `engine/kernels/photometric.py`, whose formulas these are: the window slides along rows, then along
-columns, and back the same way. The pictures' moments stay in the GPU's cache meanwhile, and the host launches
-four kernels and waits for none.
+As in `engine/kernels/photometric.py`: the window slides along rows, then along columns, and back the same
+way. The pictures' moments stay in the GPU's cache meanwhile.
 """
 
 import functools
@@ -33,10 +32,8 @@ def _moments_along_rows(
     mask = at < count
     channel, row, column = at // (height * columns), at // columns % height, at % columns
     source = (row * width + column) * 3 + channel
-    m_x = tl.zeros((BLOCK,), tl.float32)
-    m_y = tl.zeros((BLOCK,), tl.float32)
-    m_xx = tl.zeros((BLOCK,), tl.float32)
-    m_yy = tl.zeros((BLOCK,), tl.float32)
+    m_x, m_y = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    m_xx, m_yy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     m_xy = tl.zeros((BLOCK,), tl.float32)
     for k in range(WINDOW):
         tap = tl.load(taps_ptr + k)
@@ -66,10 +63,8 @@ def _dissimilarity_along_columns(
     mask = at < count
     channel, row, column = at // (lines * columns), at // columns % lines, at % columns
     source = (channel * height + row) * columns + column
-    m_x = tl.zeros((BLOCK,), tl.float32)
-    m_y = tl.zeros((BLOCK,), tl.float32)
-    m_xx = tl.zeros((BLOCK,), tl.float32)
-    m_yy = tl.zeros((BLOCK,), tl.float32)
+    m_x, m_y = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    m_xx, m_yy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     m_xy = tl.zeros((BLOCK,), tl.float32)
     for k in range(WINDOW):
         tap, here = tl.load(taps_ptr + k), rows_ptr + source + k * columns

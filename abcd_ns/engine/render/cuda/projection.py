@@ -1,19 +1,24 @@
 """Gaussians as several cameras see them, in gsplat's shapes, and these cameras on the device."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from gsplat.cuda._wrapper import spherical_harmonics
+from gsplat.cuda._wrapper import (
+    fully_fused_projection,
+    fully_fused_projection_2dgs,
+    rasterize_to_pixels,
+    rasterize_to_pixels_2dgs,
+    spherical_harmonics,
+)
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render.cuda import fused
-from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
-from abcd_ns.engine.render.projection import Splats, check_degree
+from abcd_ns.engine.render.projection import PrimitiveName, Splats, check_degree
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 KEPT = 1 << 14
@@ -62,6 +67,80 @@ def _kept_corner(x: int, y: int, device: torch.device, dtype: torch.dtype) -> Fl
         return torch.stack([torch.full((), at, device=device, dtype=dtype) for at in (x, y)])
 
 
+OnScreen = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]
+"""radii, means2d, depths, shapes and centers as in Projected, and compensations of opacities."""
+
+
+class Kind(NamedTuple):
+    """A primitive's three functions."""
+
+    shape: int
+    """Numbers of a shape."""
+    place: Callable[..., OnScreen]
+    """Gaussians in the images of cameras: world to camera, and intrinsics; whether opacities are compensated;
+    and the images' size and near plane, as in gsplat's `fully_fused_projection`."""
+    moved: Callable[[Tensor, Tensor], Tensor]
+    """Shapes [m, s] where pixels are counted from another corner, [2] or [m, 2]."""
+    draw: Callable[..., tuple[Tensor, Tensor]]
+    """Features and alphas of means2d, shapes, features and opacities; the rest as in gsplat's
+    `rasterize_to_pixels`."""
+
+
+def _place_splats(
+    gaussians: Gaussians, cameras: tuple[Tensor, Tensor], antialiased: bool, **image: Any
+) -> OnScreen:
+    """Shapes are conics."""
+    places = gaussians.means, None, gaussians.quats, gaussians.scales.exp()
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        *places, *cameras, **image, calc_compensations=antialiased
+    )
+    return radii, means2d, depths, conics, means2d, compensations
+
+
+def _place_surfels(
+    gaussians: Gaussians, cameras: tuple[Tensor, Tensor], _antialiased: bool, **image: Any
+) -> OnScreen:
+    """Shapes are the center and the matrix of `surfel`, (u, v, A, B, C, D, E, F).
+
+    The boxes' middles are found anew: gsplat's own gradient of theirs lacks some terms.
+    """
+    places = gaussians.means, gaussians.quats, gaussians.scales.exp()
+    radii, _, depths, rays, _ = fully_fused_projection_2dgs(*places, *cameras, **image)
+    matrix = rays / rays[..., 2:, 2:]
+    centers = matrix[..., :2, 2]
+    (a, b), (c, d), (e, f) = (matrix[..., row, :2].unbind(-1) for row in range(3))
+    u, v = matrix[..., :2, 2].unbind(-1)  # anew: these are no part of what `centers` gets as its gradient
+    distance = e * e + f * f - 1
+    off = ((a - u * e) * e + (b - u * f) * f, (c - v * e) * e + (d - v * f) * f)
+    means2d = torch.stack((u + off[0] / distance, v + off[1] / distance), dim=-1)
+    shapes = torch.cat((centers, torch.stack((a, b, c, d, e, f), dim=-1)), dim=-1)
+    return radii, means2d, depths, shapes, centers, None
+
+
+def _moved_surfels(shapes: Float[Tensor, "m 8"], by: Float[Tensor, "*m 2"]) -> Float[Tensor, "m 8"]:
+    x, y = by[..., :1], by[..., 1:]
+    center, across, down, away = shapes.split(2, dim=-1)
+    return torch.cat((center - by, across - x * away, down - y * away, away), dim=-1)
+
+
+def _draw_surfels(
+    means2d: Tensor, shapes: Tensor, features: Tensor, opacities: Tensor, *lists: Any, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """gsplat's absolute gradients are of its low-pass filter alone, so nobody asks for them."""
+    u, v, a, b, c, d, e, f = shapes.unbind(-1)
+    rays = torch.stack((a, b, u, c, d, v, e, f, torch.ones_like(u)), dim=-1).view(-1, 3, 3)
+    normals, densify = features.new_zeros((len(features), 3)), torch.zeros_like(means2d)
+    drawn = rasterize_to_pixels_2dgs(means2d, rays, features, opacities, normals, densify, *lists, **options)
+    return drawn[0], drawn[1]
+
+
+def kind_of(primitive: PrimitiveName) -> Kind:
+    """The functions of a primitive."""
+    if primitive == "2dgs":
+        return Kind(8, _place_surfels, _moved_surfels, _draw_surfels)
+    return Kind(3, _place_splats, lambda shapes, _: shapes, rasterize_to_pixels)
+
+
 @dataclass(frozen=True)
 class Projected:
     """n Gaussians in each of c cameras of one image size and near plane; pixels of the full images."""
@@ -105,7 +184,9 @@ def place_on_screen(
 ) -> tuple[OnScreen, Float[Tensor, "c 3"]]:
     """Where views see Gaussians, and the views' centres in world space."""
     *matrices, centers = poses(views, gaussians.means)
-    return kind.place(gaussians, tuple(matrices), views[0], antialiased), centers
+    like = views[0]
+    image = {"width": like.width, "height": like.height, "near_plane": like.near, "packed": False}
+    return kind.place(gaussians, tuple(matrices), antialiased, **image), centers
 
 
 def project(
@@ -116,12 +197,8 @@ def project(
     antialiased: bool,
     blend_weights: bool = False,
 ) -> Projected:
-    """The first half of gsplat's `rasterization(packed=False)`, for the full images.
-
-    Args:
-        views: of one size and near plane.
-        blend_weights: give zeros for the depths that are composited.
-    """
+    """The first half of gsplat's `rasterization(packed=False)`, for the full images of views of one size and
+    near plane; `blend_weights` gives zeros for the depths that are composited."""
     check_degree(gaussians, sh_degree)
     if len(gaussians) == 0:  # of which gsplat's kernels are not asked
         return Projected.nothing(len(views), kind.shape, gaussians)
@@ -157,7 +234,6 @@ class _Features(torch.autograd.Function):
         # All, whatever the degree: gsplat's kernels read those of it alone.
         coefficients = torch.cat((features_dc[:, None], features_rest), dim=1)
         *directions, coefficients = leaves = [*(means - eyes[:, None]).unbind(), coefficients]
-        ctx.graph = None
         if any(ctx.needs_input_grad):
             leaves = [value.requires_grad_() for value in leaves]
         # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
