@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
-from abcd_ns.engine.render import splat_kernels, surfel_kernels
+from abcd_ns.engine.render import splat_kernels
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.types import Gaussians, View
 
@@ -23,10 +23,7 @@ skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255
 
 @dataclass(frozen=True)
 class Primitive:
-    """How Gaussians are projected, and which tiles may draw them.
-
-    What they look like in a pixel is in `cpu/reference.py`, and in `cuda/kinds.py`.
-    """
+    """How Gaussians are projected. What they look like in a pixel is in `cpu/reference.py` and in gsplat."""
 
     name: PrimitiveName
     prefix: str
@@ -52,7 +49,7 @@ SPLATS = Primitive(
     name="3dgs",
     prefix="",
     project=splat_kernels.splat,
-    graded=splat_kernels.GRADED,
+    graded=splat_kernels.SPLAT_GRADED,
     center=splat_kernels.X,
     axes=3,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(splat_kernels.EPS_2D),
@@ -60,9 +57,9 @@ SPLATS = Primitive(
 SURFELS = Primitive(
     name="2dgs",
     prefix="surfel-",
-    project=surfel_kernels.surfel,
-    graded=surfel_kernels.GRADED,
-    center=surfel_kernels.U,
+    project=splat_kernels.surfel,
+    graded=splat_kernels.SURFEL_GRADED,
+    center=splat_kernels.U,
     axes=2,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(0.5),
 )
@@ -75,7 +72,7 @@ class Splats:
 
     planes: Float[Tensor, "r n"]
     """A row for each quantity: x, y, depth, some that give the shape, opacity, three of colour, four of
-    bounds. See splat_kernels and surfel_kernels."""
+    bounds. See splat_kernels."""
 
     def __len__(self) -> int:
         return self.planes.shape[1]

@@ -1,7 +1,5 @@
-"""Gaussians as a camera sees them, in torch: rows are quantities, columns are Gaussians.
-
-The reference of kernels/cpp/projection.h.
-"""
+"""Gaussians and surfels as a camera sees them, in torch: the reference of kernels/cpp/projection.h. Rows are
+quantities, columns are Gaussians."""
 
 from collections.abc import Sequence
 
@@ -26,11 +24,18 @@ MIN_ALPHA = 1.0 / 255.0
 REACH_MARGIN = 0.01
 """Added to the squared Mahalanobis radius of the bounds, so that rounding never loses a fragment."""
 
-X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE = range(10)
-"""Rows that `splat` gives: what is drawn, with gradients,"""
-GRADED = BLUE + 1
-COV_XX, COV_XY, COV_YY, RADIUS = range(GRADED, GRADED + 4)
+X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY = range(6)
+"""Rows that `splat` gives: what is drawn, with gradients; then opacity, red, green and blue,"""
+SPLAT_GRADED = 10
+COV_XX, COV_XY, COV_YY = range(SPLAT_GRADED, SPLAT_GRADED + 3)
 """then bounds: the 2D covariance, blur included, and gsplat's radius."""
+U, V, A, B, C, D, E, F = range(DEPTH + 1, DEPTH + 9)
+"""Rows that `surfel` gives, after the middle x, y of the box around the ellipse of one standard deviation and
+the camera z: the disc's middle on screen, the matrix; then opacity, red, green and blue,"""
+SURFEL_GRADED = 15
+"""then, without gradients, nothing in the three rows where splats have bounds, and gsplat's radius."""
+MIN_EXTENT = 1e-4
+"""Squared half sides of surfels' boxes are clamped to this, px^2."""
 
 
 def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float[Tensor, "r n"]:
@@ -71,6 +76,42 @@ def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float
     mid = 0.5 * (xx + yy)
     half = (mid + (mid * mid - det).clamp_min(0.01).sqrt()).sqrt()
     return torch.stack([*rows, xx, xy, yy, radius_of(x, y, depth, half, det > 0, number)])
+
+
+def surfel(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float[Tensor, "r n"]:
+    """Project and colour surfels, discs that are each spread as a Gaussian in its own plane: gsplat's
+    `fully_fused_projection_2dgs`, and 3DGS's colours.
+
+    As `splat`, but the third scale is not looked at. A point (s, t) of the disc, in standard deviations from
+    its middle, appears at the pixel
+
+        ((A s + B t + u) / w, (C s + D t + v) / w),    w = E s + F t + 1
+
+    where A .. F, u, v are the rows of 2DGS's splat-to-screen matrix (Huang et al. 2024; gsplat's ray
+    transform), divided by the camera z of the disc's middle.
+    """
+    wide, high, _, qw, qx, qy, qz, logit = parameters[3:11].unbind(0)
+    number = camera.unbind(0)
+    fx, fy = number[12:14]
+    depth, inverse_z, slope_x, slope_y, u, v = middles(parameters, number)
+    axes = camera_axes(number[:9], (qw, qx, qy, qz), [wide.exp(), high.exp(), torch.ones_like(wide)])
+    across, down, away = ([component[k] * inverse_z for k in range(2)] for component in axes)
+    # Relative to the middle: without the cancellation that large pixel numbers would bring.
+    a, b = (fx * (across[k] - slope_x * away[k]) for k in range(2))
+    c, d = (fy * (down[k] - slope_y * away[k]) for k in range(2))
+    distance = away[0] * away[0] + away[1] * away[1] - 1
+    per_distance = 1.0 / torch.where(distance == 0, 1.0, distance)
+    off_x = (a * away[0] + b * away[1]) * per_distance
+    off_y = (c * away[0] + d * away[1]) * per_distance
+
+    colors = sh_color(parameters, number)
+    matrix = [a + u * away[0], b + u * away[1], c + v * away[0], d + v * away[1], *away]
+    rows = [u + off_x, v + off_y, depth, u, v, *matrix, torch.sigmoid(logit), *colors]
+    extents = (off_x * off_x - (a * a + b * b) * per_distance, off_y * off_y - (c * c + d * d) * per_distance)
+    extent_x, extent_y = (extent.detach() for extent in extents)
+    half = extent_x.maximum(extent_y).clamp_min(MIN_EXTENT).sqrt()
+    radius = radius_of(rows[X].detach(), rows[Y].detach(), depth.detach(), half, distance != 0, number)
+    return torch.stack([*rows, *[torch.zeros_like(radius)] * 3, radius])
 
 
 def middles(parameters: Float[Tensor, "p n"], number: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -139,11 +180,7 @@ def _safe_sqrt(x: Tensor) -> Tensor:
 def radius_of(
     x: Tensor, y: Tensor, depth: Tensor, half: Tensor, is_sound: Tensor, number: tuple[Tensor, ...]
 ) -> Tensor:
-    """3 sigma along the longer axis, rounded up; 0 for what no pixel sees.
-
-    Args:
-        half: one sigma, px.
-    """
+    """3 sigma along the longer axis, where `half` is one, px; rounded up, 0 for what no pixel sees."""
     width, height, near = number[16], number[17], number[22]
     radius = (3.0 * half).ceil()
     drawn = (depth >= near) & (depth <= FAR_PLANE) & is_sound

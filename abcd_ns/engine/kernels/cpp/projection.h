@@ -1,5 +1,5 @@
-// Gaussians as cameras see them, and the gradient by hand. The torch functions of render/splat_kernels.py and
-// render/surfel_kernels.py are the reference; names are theirs.
+// Gaussians as cameras see them, and the gradient by hand. The torch functions of render/splat_kernels.py are
+// the reference; names are theirs.
 #pragma once
 #include <vector>
 

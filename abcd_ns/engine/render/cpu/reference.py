@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from abcd_ns.engine.render import splat_kernels as splat
-from abcd_ns.engine.render import surfel_kernels as surfel
+from abcd_ns.engine.render import splat_kernels as kernels
 from abcd_ns.engine.render.base import SUMS, ResidualSums, about, moments
 from abcd_ns.engine.render.cpu.native import Part, Pictures, Windows
 from abcd_ns.engine.render.projection import Primitive
@@ -180,7 +179,7 @@ def find_lists(
     high = ((bounds + radius) / GSPLAT_TILE).ceil() * GSPLAT_TILE - 1
     if primitive.name == "3dgs":
         reach = 2.0 * (opacity / MIN_ALPHA).log().clamp_min(0) + REACH_MARGIN
-        half = (reach * planes[[splat.COV_XX, splat.COV_YY]]).sqrt()
+        half = (reach * planes[[kernels.COV_XX, kernels.COV_YY]]).sqrt()
         low, high = low.maximum((bounds - half - 0.5).ceil()), high.minimum((bounds + half - 0.5).floor())
     ends = planes.new_tensor([[c.x, c.y, c.x + c.width - 1, c.y + c.height - 1] for c in crops]).T[:, picture]
     low, high = low.maximum(ends[:2]), high.minimum(ends[2:])
@@ -220,7 +219,7 @@ def _alphas(
     """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
     dx, dy = splats[primitive.center : primitive.center + 2] - centers
     if primitive.name == "3dgs":
-        xx, xy, yy = splats[splat.CONIC_XX : splat.CONIC_YY + 1]
+        xx, xy, yy = splats[kernels.CONIC_XX : kernels.CONIC_YY + 1]
         sigma = dx * (0.5 * xx * dx + xy * dy) + 0.5 * yy * dy * dy
         drawn = sigma >= 0
     else:
@@ -232,12 +231,13 @@ def _alphas(
 def _surfel_sigma(rows: Tensor, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
     """Where a pixel's ray meets the disc, or gsplat's low-pass filter around its box's middle. As in gsplat,
     rays within the disc's plane meet nothing."""
-    a, b, c, d, e, f = surfel.relative_matrix(rows.unbind(0))
+    u, v, a, b, c, d, e, f = rows.unbind(0)[kernels.U : kernels.F + 1]
+    a, b, c, d = a - u * e, b - u * f, c - v * e, d - v * f  # pixels are counted from the disc's middle
     w = (a * d - b * c) - dx * (f * c - e * d) - dy * (e * b - f * a)
     meets = w != 0
     inverse = 1.0 / torch.where(meets, w, 1.0)
     s, t = (b * dy - d * dx) * inverse, (c * dx - a * dy) * inverse
-    box_x, box_y = dx + (rows[X] - rows[surfel.U]), dy + (rows[Y] - rows[surfel.V])
+    box_x, box_y = dx + (rows[X] - rows[kernels.U]), dy + (rows[Y] - rows[kernels.V])
     on_disc, filtered = 0.5 * (s * s + t * t), box_x * box_x + box_y * box_y
     is_disc = on_disc <= filtered
     # What is divided by next to nothing may be infinite where the filter counts.
