@@ -18,13 +18,7 @@ class _Photometric(torch.autograd.Function):
     """The weighed sum of both losses, which finds its gradient in the same go."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        rendered: Float[Tensor, "h w 3"],
-        photo: Float[Tensor, "h w 3"],
-        by_pixel: float,
-        by_window: float,
-    ) -> Float[Tensor, ""]:
+    def forward(ctx: Any, rendered: Tensor, photo: Tensor, by_pixel: float, by_window: float) -> Tensor:
         found = fused.photometric(rendered, photo, by_pixel, by_window)
         if found is None:
             sums, gradient = photometric_sums(rendered, photo, (by_pixel, by_window))

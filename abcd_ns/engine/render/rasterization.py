@@ -64,13 +64,11 @@ def rasterization(
     On a CPU by this package's kernels, on CUDA by gsplat's. Differentiable in the Gaussians.
 
     Args:
-        means: centres, world units.
+        means, scales: centres and standard deviations, world units.
         quats: rotations (w, x, y, z); need not be normalised.
-        scales: standard deviations, world units.
         opacities: 0..1.
         colors: 0 or more; with `sh_degree` the coefficients of spherical harmonics, k of 1, 4, 9 or 16.
-        viewmats: world to camera, OpenCV convention.
-        Ks: intrinsics in pixels.
+        viewmats, Ks: world to camera, OpenCV convention; intrinsics in pixels.
         near_plane: Gaussians whose mean has a smaller camera z are not drawn; world units.
         sh_degree: in use; at most what k allows.
         backgrounds: behind the colours; depth has none.
@@ -92,9 +90,11 @@ def rasterization(
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
     rasters = _draw(gaussians, views, **options, **({"absgrad": True} if absgrad else {}))
-    color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
+    color = torch.stack([raster.color for raster in rasters])
+    alphas = torch.stack([1 - raster.transmittance[..., None] for raster in rasters])
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]
+    depth = torch.stack([raster.depth[..., None] for raster in rasters])
     if "ED" in render_mode:
         depth = depth / alphas.clamp_min(1e-10)
     wanted = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode)
@@ -107,11 +107,6 @@ def _draw(gaussians: Gaussians, views: Sequence[View], **options: Any) -> tuple[
     if "absgrad" in options and not isinstance(rasterizer, TorchRasterizer):
         raise ValueError(NO_ABSGRAD)
     return rasterizer.draw(gaussians, [Shot(view, view.full) for view in views], **options)
-
-
-def _channels(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour [h, w, 3], alpha and depth [h, w, 1]."""
-    return raster.color, 1 - raster.transmittance[..., None], raster.depth[..., None]
 
 
 def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any], **words: str) -> None:
@@ -128,7 +123,9 @@ def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any], **words
         raise ValueError(f"colors must be {wanted}, not {list(colors.shape)}.")
 
 
-def _check_alike(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> None:
+def _before_activation(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+) -> Gaussians:
     """Raise ValueError unless there is one of each for each Gaussian, in one dtype and on one device: the
     native library reads memory by the means' number and type."""
     shapes = {"means": (means, 3), "quats": (quats, 4), "scales": (scales, 3), "opacities": (opacities,)}
@@ -138,12 +135,6 @@ def _check_alike(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor
         if (value.dtype, value.device) != (means.dtype, means.device) or not value.is_floating_point():
             kind = f"{name} are {value.dtype} on {value.device}, and means {means.dtype} on {means.device}"
             raise ValueError(f"{kind}: give all as one floating-point type, on one device.")
-
-
-def _before_activation(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
-) -> Gaussians:
-    _check_alike(means, quats, scales, opacities, colors)
     if colors.ndim == 2:
         colors = ((colors - 0.5) / SH_C0)[:, None]
     return Gaussians(

@@ -113,16 +113,14 @@ def _values_and_gradients(
     options = {"antialiased": case.antialiased, "blend_weights": case.wants_weights, "residual_sums": True}
     rasters = rasterizer.draw(Gaussians(**leaves), shots, sh_degree=case.sh_degree, **options)
     infos = list({id(raster.info): raster.info for raster in rasters}.values())
-    means2d = [info["means2d"] for info in infos]
-    for each in means2d:
-        each.retain_grad()
     for info in infos:
+        info["means2d"].retain_grad()
         info["sums"].ask([_residual(raster) for raster in rasters if raster.info is info])
     sum(map(_loss, rasters)).backward()
     planes = ("color", "transmittance", "depth")
     results = {name: [getattr(raster, name).flatten() for raster in rasters] for name in planes}
     results |= {f"gradient of {name}": [leaves[name].grad] for name in PARAM_NAMES}
-    results["gradient of means2d"] = [each.grad for each in means2d]
+    results["gradient of means2d"] = [info["means2d"].grad for info in infos]
     results["sums of residuals"] = [info["sums"].values for info in infos]
     results |= {"weights": [info["weights"].grad for info in infos]} if case.wants_weights else {}
     return {name: torch.cat(value).detach().cpu().double() for name, value in results.items()}

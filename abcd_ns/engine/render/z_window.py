@@ -49,7 +49,6 @@ class TileGrid:
 
     @property
     def tiles(self) -> int:
-        """How many there are."""
         return self.rows * self.cols
 
     def middles(
@@ -134,11 +133,7 @@ class ZWindow:
 
 
 def ends_of(window: ZWindow | None, grid: TileGrid, like: Tensor) -> Float[Tensor, "2 t"]:
-    """(near, far) of a window in the tiles of a grid, see ZWindow.on; None masks nothing.
-
-    Args:
-        like: has the dtype and device for None.
-    """
+    """(near, far) of a window in the tiles of a grid, see ZWindow.on. None, as `like`, masks nothing."""
     found = ZWindow.everything(grid, like.device, like.dtype) if window is None else window.on(grid)
     return torch.stack((found.near, found.far))
 
@@ -156,8 +151,7 @@ def showing(
 
     Frozen fragments in front of this range and behind it can be drawn once for a visit; those in it have to
     be sorted in with the Gaussians that are trained. So the range must hold every fragment that matters, and
-    the narrower it is, the less is drawn in each step. A cell's own depth range is neither: it leaves out
-    what reaches out of the cell, and holds much empty space.
+    the narrower it is, the less is drawn in each step.
 
     Args:
         pixels: of its crop in each tile; 0 for one that a crop does not have.

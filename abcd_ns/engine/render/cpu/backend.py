@@ -26,8 +26,6 @@ from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 PIXELS_AT_ONCE, SPLATS_AT_ONCE = 1 << 17, 200_000
 """Of the views that layers are drawn for in one pass, at most: for a few pixels or Gaussians calls cost more
 than what they compute."""
-
-
 NO_ABSGRAD = "absgrad=True is not supported here: it takes 3dgs in float32 on a CPU, and a C++ compiler."
 
 
@@ -74,9 +72,8 @@ class TorchRasterizer(Rasterizer):
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once.
 
-        Args:
-            absgrad: after backward `info["means2d"].absgrad` [v, n, 2] is gsplat's: sums of each pixel's
-                absolute gradient. By the native kernel, of 3dgs.
+        With `absgrad`, `info["means2d"].absgrad` [v, n, 2] is gsplat's after backward: sums of each pixel's
+        absolute gradient. By the native kernel, of 3dgs.
         """
         planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
         center = slice(self.primitive.center, self.primitive.center + 2)
@@ -142,9 +139,7 @@ class TorchRasterizer(Rasterizer):
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Transmittance, right where above a half, and median depth with these Gaussians behind others.
 
-        Args:
-            window: where in each tile fragments count; None for everywhere.
-            in_front: the same of the others; for none 1 and 0.
+        Of these `in_front` is the same: 1 and 0 for none. Without a `window` fragments count everywhere.
         """
         left, depth = in_front
         state = torch.stack((torch.where(left > 0.5, left, -left), depth))

@@ -23,30 +23,26 @@ COEFFICIENTS = (0, 3, 8, 15)
 """Of harmonics above degree 0, that it takes."""
 
 
+_POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64
+
+
 class _Parameters(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("means", "scales", "quats", "dc", "rest", "opacities")),
-        *((name, ctypes.c_int64) for name in ("n", "coefficients")),
+        *((name, _POINTER) for name in ("means", "scales", "quats", "dc", "rest", "opacities")),
+        *(("n", _LONG), ("coefficients", _LONG)),
     )
 
 
 class _Part(ctypes.Structure):
-    _fields_ = (
-        ("planes", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ("row", "count")),
-        *((name, ctypes.c_int32) for name in ("picture", "masked")),
-    )
+    _fields_ = (("planes", _POINTER), ("row", _LONG), ("count", _LONG), ("picture", _INT), ("masked", _INT))
 
 
 class _Picture(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int32) for name in ("x", "y", "width", "height")),
-        *((name, ctypes.c_void_p) for name in ("near", "far")),
-    )
+    _fields_ = (*((name, _INT) for name in Crop._fields), ("near", _POINTER), ("far", _POINTER))
 
 
 class _Image(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("color", "transmittance", "depth", "residual"))
+    _fields_ = tuple((name, _POINTER) for name in ("color", "transmittance", "depth", "residual"))
 
 
 def _parameters(tensors: Sequence[Tensor]) -> _Parameters:
@@ -104,12 +100,8 @@ Pictures = list[tuple[Float[Tensor, "_h _w 3"], Float[Tensor, "_h _w"], Float[Te
 
 
 class Lists:
-    """What each tile of some pictures has to draw, front to back.
-
-    Args:
-        windows: leave out of masked parts what lies outside.
-        wants_weights: depths are 0, see Rasterizer.draw.
-    """
+    """What each tile of some pictures has to draw, front to back. Windows leave out of masked parts what lies
+    outside; with `wants_weights` depths are 0, see Rasterizer.draw."""
 
     def __init__(
         self,
