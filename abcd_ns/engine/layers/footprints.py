@@ -10,7 +10,7 @@ from torch import Tensor
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.influence import COARSE_SIDE, coarser, in_passes
-from abcd_ns.engine.space.visibility import CROP_ALIGN, footprint
+from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -35,12 +35,8 @@ class VisitGeometry:
 def footprints(
     gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer, share: float = 1.0
 ) -> VisitGeometry:
-    """Which views see the block's Gaussians, and where in the image.
-
-    Args:
-        share: of their weight in each picture, with nothing before them, that the crop holds: a few wide and
-            faint ones would make it the whole image.
-    """
+    """Which views see the block's Gaussians, and where in the image. A crop holds a `share` of their weight
+    in the picture, with nothing before them: a few wide and faint ones would make it the whole image."""
     views = tuple(views)
     if not views:
         return VisitGeometry(block, {})
@@ -58,11 +54,9 @@ def footprints(
 
 def _crops(views: Sequence[View], extents: Float[Tensor, "v 4"]) -> dict[int, Crop]:
     """By view index; of those where there is something."""
-    found = (
-        footprint(extent, view, margin=CROP_MARGIN, align=CROP_ALIGN)
-        for view, extent in zip(views, extents.tolist(), strict=True)
-    )
-    return {view.index: crop for view, crop in zip(views, found, strict=True) if crop is not None}
+    pairs = zip(views, extents.tolist(), strict=True)
+    found = {view.index: footprint(extent, view, CROP_MARGIN) for view, extent in pairs}
+    return {view: crop for view, crop in found.items() if crop is not None}
 
 
 @torch.no_grad()

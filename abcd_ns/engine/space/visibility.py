@@ -20,32 +20,31 @@ BOUNDS_SLANT = 3.0
 ROUNDING = 2.0
 """Frusta are this much wider than what they must hold, px; generously."""
 CROP_ALIGN = 16
-"""Crops begin and end on multiples of so many pixels, or at the image's edge."""
+"""Crops begin and end on multiples of so many pixels, or at the image's edge. These are gsplat's tiles: it
+draws a Gaussian on all of each that its square touches."""
 
 
-def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int = 16) -> Crop | None:
+def footprint(extent: Sequence[float], view: View, margin: int = 0) -> Crop | None:
     """The smallest aligned crop that holds everything that some projected Gaussians can draw, if it is in the
     image.
 
     Args:
         extent: where that is: (left, top, right, bottom), px; see Rasterizer.extents.
-        margin: grow by this many px (a loss that looks at neighbouring pixels needs it).
-        align: move the edges outward to multiples of this many px, or to the image's border. With the
-            rasterizer's tile size (gsplat's is 16) no pixel is missed: it draws a Gaussian on all of
-            each tile that its square touches, which may be beyond the square.
+        margin: grow by this many px (a loss that looks at neighbouring pixels needs it), before edges are
+            aligned.
     """
     x0, y0, x1, y1 = extent
     if x0 > x1:
         return None
-    x, width = _aligned_span(x0, x1, view.width, margin, align)
-    y, height = _aligned_span(y0, y1, view.height, margin, align)
+    x, width = _aligned_span(x0, x1, view.width, margin)
+    y, height = _aligned_span(y0, y1, view.height, margin)
     return Crop(x, y, width, height)
 
 
-def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:
+def _aligned_span(low: float, high: float, size: int, margin: int) -> tuple[int, int]:
     """(first pixel, number of pixels) of [low, high] grown, aligned outward and clipped to 0 .. size."""
-    start = (math.floor(max(low, 0.0)) - margin) // align * align
-    stop = -((-math.ceil(min(high, float(size))) - margin) // align) * align
+    start = (math.floor(max(low, 0.0)) - margin) // CROP_ALIGN * CROP_ALIGN
+    stop = -((-math.ceil(min(high, float(size))) - margin) // CROP_ALIGN) * CROP_ALIGN
     start, stop = max(start, 0), min(stop, size)
     return start, stop - start
 
@@ -162,7 +161,7 @@ class Frusta:
         for row in shows.any(dim=0).nonzero()[:, 0].tolist():
             view, crop = self.seen[row]
             extent = (*lower[row].tolist(), *upper[row].tolist())
-            drawn = footprint(extent, view, margin=math.ceil(self._margin), align=CROP_ALIGN)
+            drawn = footprint(extent, view, math.ceil(self._margin))
             if drawn is not None and (shared := drawn.shared(crop)) is not None:
                 found[view.index] = shared
         return shows, found
