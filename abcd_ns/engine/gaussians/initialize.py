@@ -150,8 +150,7 @@ def thin_points(
     """One point, the mean of place and colour, for all that lie in one small cube.
 
     A reconstruction is made from photos of full size, and may have dozens of points where the pictures that
-    are trained on have one pixel. What is finer than half a pixel's width no picture can show, by sampling
-    theory, and in practice what is finer than the rasterizer's low-pass filter, of some pixel's width.
+    are trained on have one pixel, which no picture can show.
 
     Cubes have sides of powers of 2: the largest that are no larger than `pixels` pixels of the view that sees
     the point from nearest. Points that no view sees stay as they are.
@@ -185,13 +184,8 @@ def thin_points(
 
 
 def _means_by_owner(values: Tensor, order: Tensor, owner: Tensor, number: Tensor) -> Float64[Tensor, "m 3"]:
-    """The mean of values [n, 3] over each owner's rows.
-
-    Args:
-        order: rows of `values`, those of one owner together.
-        owner: of each place in `order`.
-        number: rows of each owner.
-    """
+    """The mean of values [n, 3] over each owner's rows: `order` has the rows, those of one owner together,
+    `owner` the owner of each place in it, and `number` how many rows each owner has."""
     total = torch.zeros(len(number), 3, dtype=torch.float64)
     for rows, owners in zip(order.split(CHUNK), owner.split(CHUNK), strict=True):
         total.index_add_(0, owners, values[rows].double())

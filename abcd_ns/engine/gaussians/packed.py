@@ -59,11 +59,7 @@ class Packed(NamedTuple):
 
 
 def pack(parts: Mapping[str, Gaussians]) -> Packed:
-    """Gaussians and what else is shaped as they are.
-
-    Args:
-        parts: by what is set before the names; the Gaussians themselves by "".
-    """
+    """Gaussians, by "", and what else is shaped as they are, by what is set before the names."""
     degrees = degrees_in_use([part.features_rest for part in parts.values()])
     coefficients = parts[""].features_rest.shape[1]
     kept = up_to_degree(degrees, coefficients)

@@ -41,15 +41,14 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
     """Make `state` the active block: new Parameters, with its moments as Adam's state.
 
     The Parameters that were active before lose their memory at once, even where something (a logged loss,
-    say) still refers to them.
-
-    Args:
-        batch: views in each of the steps to come, see `Pace.set`.
+    say) still refers to them. Each of the steps to come has `batch` views, see `Pace.set`.
     """
     for name, value in state.gaussians.items():
         parameter = Parameter(value.detach().clone())
         group = optimizers[name].param_groups[0]
-        _release(group["params"][0], optimizers[name])
+        before = group["params"][0]
+        optimizers[name].state.pop(before, None)
+        before.grad, before.data = None, before.data.new_empty(0)
         group["params"] = [parameter]
         optimizers[name].state[parameter] = {
             "step": adam_step(state.clocks, batch).to(value.device),  # fused Adam reads it there
@@ -77,10 +76,7 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
     """The active block as a BlockState on the CPU, which shares no memory with later steps. It stays active.
 
     From a GPU up to PINNED_BYTES of the copies are in pinned memory. That is not for keeping: what is
-    persisted is copied once more.
-
-    Args:
-        growth: density control's statistics, each [n]; copied.
+    persisted is copied once more. Density control's statistics in `growth`, each [n], are copied, too.
     """
     adam = {name: optimizers[name].state[params[name]] for name in PARAM_NAMES}
     moments = [adam[name][moment] for moment in MOMENTS for name in PARAM_NAMES]
@@ -105,8 +101,8 @@ def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
     """Steps of `batch` views that would have let the moments forget as much as they have.
 
     Adam divides its moments by 1 - beta**step, with the beta of the present steps: so `step` counts these,
-    and may be a fraction. It is rounded, so that counting on from it is exact: a run that is resumed in the
-    middle of a visit counts the same numbers as one that was not.
+    and may be a fraction. It is rounded, so that a run that is resumed in the middle of a visit counts the
+    same.
     """
     return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)
 
@@ -130,11 +126,8 @@ def nothing_active(
 
 
 class Pace:
-    """Learning rates and memories of the optimizers, as they were given for steps of one view each.
-
-    Args:
-        fast_start: they are larger while a block has had few steps, see `rates_of_under_trained`.
-    """
+    """Learning rates and memories of the optimizers, as they were given for steps of one view each. With
+    `fast_start` rates are larger while a block has had few steps, see `rates_of_under_trained`."""
 
     def __init__(self, optimizers: Optimizers, fast_start: bool) -> None:
         groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
@@ -166,9 +159,3 @@ def rates_of_under_trained(views: int, batch: int) -> float:
     """
     steps = max(views, 1) / batch
     return max(min(math.sqrt(RATED_FOR / steps), UNDER_TRAINED_RATES) / batch, 1.0)
-
-
-def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:
-    optimizer.state.pop(parameter, None)
-    parameter.grad = None
-    parameter.data = parameter.data.new_empty(0)

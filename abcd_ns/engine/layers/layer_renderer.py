@@ -103,12 +103,8 @@ class Loaded:
 
 
 class LayerRenderer:
-    """Draws the frozen blocks of a scene.
-
-    Args:
-        pass_gaussians: the most Gaussians that one drawing may take on the device. A node of the tree
-            that holds more is drawn in parts, down to single blocks.
-    """
+    """Draws the frozen blocks of a scene, at most `pass_gaussians` at once on the device: a node of the tree
+    that holds more is drawn in parts, down to single blocks."""
 
     def __init__(
         self,
@@ -279,11 +275,8 @@ class LayerRenderer:
 
     @torch.no_grad()
     def picture(self, view: View, settings: RenderSettings, stop: float = 0.0) -> Raster:
-        """The whole scene through layers, nearest node first: the composited render. `info` is empty.
-
-        Args:
-            stop: transmittance below which nothing behind is drawn, if no pixel has more.
-        """
+        """The whole scene through layers, nearest node first: the composited render. `info` is empty. Once no
+        pixel's transmittance is `stop` or more, nothing behind is drawn."""
         whole = self.nothing(view)
         for node, gaussians in self.loaded_in_order(view):
             whole = drawn_over(whole, self.raster(node, gaussians, view, settings))

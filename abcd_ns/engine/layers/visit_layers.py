@@ -60,10 +60,8 @@ class VisitLayers:
         self._sum: Tensor | float = 0.0
 
     def draw(self, views: Sequence[int], alive: Callable[[], None] = lambda: None) -> Iterator[Kept]:
-        """Draw F and B of these views and keep what there is room for; yields each when it is ready.
-
-        Args:
-            alive: called for each picture of a node, of which many come before the first view is ready.
+        """Draw F and B of these views and keep what there is room for; yields each when it is ready. `alive`
+        is called for each picture of a node, of which many come before the first view is ready.
 
         Raises:
             RuntimeError: when all are drawn, if some pixel is NaN or infinite.

@@ -1,10 +1,9 @@
 """Pictures of the whole scene, one node of it on the device at a time, and their gradient, by the pose say.
 
-As exact joint training has them (peers/exact.py), but for the camera: every node is drawn without gradients
-and all are folded to the picture; a loss gives G = dL/dC; every node is drawn again, with gradients, and
-dL/dC_A = T_F G, dL/dT_A = T_F <G, C_B + T_B b>, where F and B are what is before and behind it. What the pose
-gets from each node is added up. Layers are cut where the rays of the given pose cross from cell to cell: a
-fragment that moves over a border is the same in either layer, so that the gradient has no part of it.
+Every node is drawn without gradients and all are folded to the picture; a loss gives G = dL/dC; every node is
+drawn again, with gradients, between what is before and behind it, see `sandwich`. What the pose gets from
+each node is added up. Layers are cut where the rays of the given pose cross from cell to cell: a fragment
+that moves over a border is the same in either layer, so that the gradient has no part of it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,11 +30,8 @@ from abcd_ns.engine.types import View
 
 
 class WholePictures:
-    """Draws a scene for it, or for poses, to be judged by: on black, not clamped, with no info.
-
-    Args:
-        layers_bytes: size of the layers held at a time, unless a single view has more.
-    """
+    """Draws a scene for it, or for poses, to be judged by: on black, not clamped, with no info. Layers held
+    at a time take `layers_bytes`, unless a single view has more."""
 
     def __init__(
         self, renderer: LayerRenderer, settings: RenderSettings, layers_bytes: int = PARTS_BYTES
@@ -59,10 +55,7 @@ class WholePictures:
         self, views: Sequence[View], gradient: Callable[[View, Raster], Float[Tensor, "h w 3"]]
     ) -> list[Float[Tensor, "4 4"]]:
         """The gradient of a loss by each view's world-to-camera matrix, all of whose entries count as free.
-
-        Args:
-            gradient: gives dL/dC of a view's picture.
-        """
+        `gradient` gives dL/dC of a view's picture."""
         leaves = [replace(view, viewmat=view.viewmat.detach().clone().requires_grad_()) for view in views]
         self.backward(leaves, gradient)
         return [

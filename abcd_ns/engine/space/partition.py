@@ -16,9 +16,9 @@ scene needs, few enough to fit in memory."""
 def best_split(points: Float[Tensor, "n 3"], box: Box, share: float = 0.5) -> tuple[int, float]:
     """Where to cut `box` so that `share` of its points fall to the left.
 
-    Takes the axis along which the points reach furthest, outliers aside, unless equal coordinates make
-    that cut miss its share by over a tenth of the points and another axis does better. Points that all
-    coincide (or are missing) cannot be shared out: then an empty cell is cut off.
+    Takes the axis along which the points reach furthest, outliers aside, unless equal coordinates make that
+    cut miss its share by over a tenth of the points and another axis does better. An empty cell is cut off
+    where all points coincide, or there are none.
 
     Args:
         points: inside `box`, finite.

@@ -163,9 +163,8 @@ class BlockTree:
         return tuple(found)
 
     def split(self, block: int, axis: int, threshold: float) -> "BlockTree":
-        """A new tree in which the block's cell is cut in two and all else is as it was.
-
-        The part below `threshold` keeps the block's id, the other becomes block `num_blocks`.
+        """A new tree in which the block's cell is cut in two: the part below `threshold` keeps the block's
+        id, the other becomes block `num_blocks`.
 
         Raises:
             ValueError: no such block or axis, or the plane does not cut the block's cell.
@@ -197,11 +196,8 @@ def node_children_in_order(tree: BlockTree, node: int, center: Sequence[float]) 
 
     A ray that starts on one side of a plane can cross to the other but never back. So whatever lies on the
     camera's side of a split is in front of whatever lies beyond it, along every ray; by induction over the
-    tree there is one order for the whole image. Sorting cells by the depth of their centres has no such
-    guarantee. (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures".)
-
-    The centre is compared with the threshold in float64, by the rule that BlockTree.assign uses for
-    points: exactly on the plane counts as right.
+    tree there is one order for the whole image. (Fuchs, Kedem and Naylor 1980, "On visible surface generation
+    by a priori tree structures".) The centre is compared with the threshold as BlockTree.assign does.
     """
     axis, threshold, left, right, _ = tree.rows[node]
     return (left, right) if center[axis] < threshold else (right, left)

@@ -1,9 +1,8 @@
 """The warm-up: as many Gaussians as the memory of one visit holds, all over the scene, trained at once.
 
-Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
-visits are spent on that. A coarse model is a coarse picture of everything that fits where one block fits,
-needs no layers, and takes little of the time. The remaining Gaussians are deferred, then each in its block,
-unseen until that is visited for the first time: neighbours look to each other as they were trained to look.
+Blocks that begin among neighbours which are still blobs learn little from them. A coarse model fits where one
+block fits, needs no layers, and takes little of the time. The remaining Gaussians are deferred: each is
+unseen in its block until that is visited, so that neighbours look to each other as they were trained to look.
 """
 
 import math

@@ -208,11 +208,8 @@ class ParameterStore:
         self._collect()
 
     def restore(self, name: str) -> int:
-        """Make what is pinned under `name` a new generation; return its number. The pin stays.
-
-        Blocks keep the versions they were pinned with. The number grows, so that no version is ever given to
-        two different contents.
-        """
+        """Make what is pinned under `name` a new generation; return its number, which grows. The pin stays,
+        and blocks keep the versions they were pinned with."""
         self._require_writable()
         pinned = read_checked_manifest(manifest_path(self.folder, name))
         with self._or_roll_back(f"Pin {name!r} could not be restored"):

@@ -1,12 +1,10 @@
 """Writes to a store beside the training: snapshots of a run, each whole, one after the other.
 
-A thread does it, which lives as long as there is something to write. It is a daemon: the end of the process
-ends it, which is as if the process had been killed.
+A daemon thread does it, which lives as long as there is something to write.
 
 Processes that train a block are forked from this one, and a thread does not live on in a fork. So a fork
-waits until the thread is between two writes, and holds the lock: no write, and nothing that it holds within
-torch, the store or the C library, is ever cut in two. The child writes nothing and reads no store: it has
-all blocks.
+waits until the thread is between two writes, and holds the lock: no write is ever cut in two. The child
+writes nothing and reads no store: it has all blocks.
 """
 
 import math
