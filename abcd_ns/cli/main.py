@@ -15,8 +15,8 @@ from abcd_ns.errors import UserError, missing
 class Command(NamedTuple):
     """A subcommand: `target` is the "module:function" that tyro makes a command line of.
 
-    A module is imported in a second or two; nerfstudio, which takes longer, where the options are known to be
-    right. The function may return an exit code; None is 0. It raises UserError where an option is out of range, what
+    A module takes a second or two. It imports nerfstudio, which takes longer, where the options are right.
+    The function may return an exit code; None is 0. It raises UserError where an option is out of range, what
     it is given cannot be used, or what it shall write is there already.
     """
 

@@ -95,8 +95,8 @@ def test_arguments_reach_the_function_which_sets_the_exit_code(greet, capsys):
         (
             "missing",
             2,
-            "error: abcd_ns cannot start here (ModuleNotFoundError: No module named 'no_such_package'): install "
-            "it again, by pip install in this environment; `abcd doctor` looks closer.\n",
+            "error: abcd_ns cannot start here (ModuleNotFoundError: No module named 'no_such_package'): "
+            "install it again, by pip install in this environment; `abcd doctor` looks closer.\n",
         ),
         ("ctrl-c", 130, ""),
     ],

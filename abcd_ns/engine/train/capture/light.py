@@ -90,10 +90,8 @@ class Light:
             if kept is None:
                 continue
             if kept.meta["kind"] != self.kind:
-                raise UserError(
-                    f"The run was begun with --pipeline.training.light {kept.meta['kind']}: take that, "
-                    f"not with {self.kind}."
-                )
+                begun = f"--pipeline.training.light {kept.meta['kind']}"
+                raise UserError(f"The run was begun with {begun}, not {self.kind}: give that.")
             for name, value in self._tensors(part).items():
                 value.copy_(kept.tensors[name])
 
