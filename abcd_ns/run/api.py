@@ -80,6 +80,8 @@ def train(
     _check(views, photos, steps, options, device, folder)
     if not 0 < len(places) == len(colors):
         raise UserError(f"There are {len(places)} points and {len(colors)} colours: give one for each.")
+    if not places.isfinite().all(dim=1).any():
+        raise UserError("No point is finite: give points in the world space of the views.")
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
 

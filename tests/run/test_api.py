@@ -73,6 +73,7 @@ def test_it_trains_as_ns_train_does(tmp_path):
         ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
         ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
         ({"photos": [torch.full((36, 48, 3), 200.0)] * 2}, "Photo 0 is no picture of 0..1"),
+        ({"points": (torch.full((2, 3), torch.nan), torch.zeros(2, 3))}, "No point is finite"),
         ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
         ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
         ({"options": RunOptions(blocks=-1)}, "blocks must be 0 or more"),

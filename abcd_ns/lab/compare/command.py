@@ -248,7 +248,8 @@ def arms_of(given: Options) -> list[tuple[str, ...]]:
     changes = [parse_changes(text, REGISTERED["abcd"].pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
     of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]
-    if twice := [one for one in changes if changes.count(one) > 1] + of_blocks:
+    sets = list(map(set, changes))
+    if twice := [one for one in changes if sets.count(set(one)) > 1] + of_blocks:
         raise UserError(f"{' '.join(twice[0])!r} is given twice.")
     return [(*size, *change) for size in sizes for change in [(), *changes]]
 

@@ -41,7 +41,7 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"blocks": (2, 2)}, "--blocks 2 2: give different numbers"),
         ({"blocks": (1, 65_537)}, "--blocks is 65537; it must be at most 65536"),
         ({"vary": ("training.batch=1", "training.btach=2")}, "no option 'training.btach'"),
-        ({"vary": ("blocks=2", "blocks=2")}, "'blocks=2' is given twice"),
+        ({"vary": ("blocks=2 workers=1", "workers=1 blocks=2")}, "'blocks=2 workers=1' is given twice"),
         ({"vary": ("blocks=2",), "blocks": (1, 8)}, "'blocks=2' is given twice"),
         ({"methods": ()}, "at least one"),
         ({"methods": ("abcd", "abcd")}, "each once"),
