@@ -54,12 +54,12 @@ def test_what_is_no_number_is_said_at_once(coordinator, capsys):
 
 def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
     coordinator.state.views = {0: 3, 1: 0, 2: 1}
-    coordinator.state.health = {0: BlockHealth(visits=2, oversized=3), 2: BlockHealth(visits=1)}
+    coordinator.state.health = {0: BlockHealth(visits=2, oversized=3, hidden=True), 2: BlockHealth(visits=1)}
     ProgressReport(coordinator).close()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("Trained 0 steps in 0 visits")
     assert lines[1:] == [
-        "  block 1: trained",
+        "  block 1: hidden behind others, passed over",
         "  block 2: seen by no view, left as it was",
         "  block 3: seen by 1 view only",
         "  3 oversized Gaussians shrunk",

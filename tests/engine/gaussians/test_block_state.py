@@ -1,7 +1,6 @@
 """Stored blocks, and swapping them into active parameters and Adam."""
 
 import copy
-from dataclasses import replace
 
 import pytest
 import torch
@@ -63,21 +62,6 @@ def test_a_statistic_that_one_side_lacks_starts_at_zero():
 def test_tensors_of_unequal_length_are_refused():
     with pytest.raises(ValueError, match="equally many rows"):
         BlockState(random_gaussians(3), random_gaussians(2), random_gaussians(3))
-
-
-def test_a_block_that_was_persisted_trains_as_if_it_had_not():
-    state = some_state(6)
-    stayed = active(state)
-    take_steps(*stayed, 5)
-    moved = active(state)
-    take_steps(*moved, 2)
-    clocks = replace(state.clocks, adam_views=state.clocks.adam_views + 2)
-    stored = detach(*moved, state.growth, clocks)
-    attach(some_state(4, seed=9), *moved)
-    take_steps(*moved, 3)
-    attach(stored, *moved)
-    take_steps(*moved, 3)
-    assert_same(detach(*moved, state.growth, state.clocks), detach(*stayed, state.growth, state.clocks))
 
 
 def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():

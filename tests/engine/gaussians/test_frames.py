@@ -37,16 +37,3 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moves_along(seed):
     assert float(before.color.max()) > 0.05
     assert torch.allclose(after.color, before.color, atol=1e-9)
     assert torch.allclose(after.transmittance, before.transmittance, atol=1e-9)
-
-
-@given(numbers)
-def test_there_and_back(seed):
-    frame = random_frame(seed)
-    gaussians = random_gaussians(20, seed, sh_degree=2, dtype=torch.float64)
-    back = frame.inverse.gaussians(frame.gaussians(gaussians))
-    for name, value in gaussians.items():
-        found = getattr(back, name)
-        if name == "quats":  # q and -q are one rotation
-            value = value / value.norm(dim=1, keepdim=True)
-            found = found * (found * value).sum(dim=1, keepdim=True).sign()
-        assert torch.allclose(found, value, atol=1e-10), name

@@ -5,8 +5,6 @@ import warnings
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.initialize import (
     THICKNESS,
@@ -112,19 +110,6 @@ def test_a_pixel_is_as_wide_as_the_nearest_view_that_sees_the_point_has_it():
                 seen.append(z / float(view.K[0, 0]))
         torch.testing.assert_close(float(width), min(seen, default=float("inf")), rtol=1e-5, atol=0)
     assert found[2].isinf()
-
-
-@given(seed=st.integers(0, 1000), pixels=st.floats(0.1, 8), width=st.floats(0.05, 2.0))
-def test_no_point_is_far_from_the_one_that_stands_for_it(seed, pixels, width):
-    points, colors = cloud(60, seed, width)
-    found, tints = thin_points(points, colors, VIEWS, pixels)
-    assert 1 <= len(found) <= len(points)
-    assert len(tints) == len(found)
-    size = pixels * finest_pixel(points, VIEWS)
-    away = torch.cdist(points.double(), found.double()).amin(dim=1)
-    assert bool((away <= 3**0.5 * size + 1e-6).all())
-    assert float(tints.min()) >= float(colors.min()) - 1e-3
-    assert float(tints.max()) <= float(colors.max()) + 1e-3
 
 
 def test_points_that_nobody_sees_stay_and_so_do_all_at_0():

@@ -1,7 +1,5 @@
 """Compositing: the algebra of layers, against the formula written out pixel by pixel."""
 
-from itertools import pairwise
-
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -48,14 +46,6 @@ def by_hand(layers: list[Layer]) -> Layer:
 def test_fold_is_the_sum_over_layers(seed, n, dtype):
     layers = random_layers(seed, n, dtype)
     assert_close(fold(layers), by_hand(layers))
-
-
-@given(SEEDS, DTYPES, st.lists(st.integers(0, 8), max_size=4))
-def test_any_cut_of_the_list_gives_the_same(seed, dtype, cuts):
-    layers = random_layers(seed, 8, dtype)
-    bounds = [0, *sorted(cuts), 8]
-    runs = [fold(layers[a:b], like=layers[0]) for a, b in pairwise(bounds)]  # Some are empty.
-    assert_close(fold(runs), fold(layers))
 
 
 @given(SEEDS, DTYPES, st.booleans())

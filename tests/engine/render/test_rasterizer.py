@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.render.z_window import TileGrid
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
+from abcd_ns.engine.types import PARAM_NAMES, Crop
 from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
     as_leaves,
@@ -146,35 +146,6 @@ def test_weighing_adds_up_what_gaussians_fill_and_changes_nothing_else():
     assert bool((raster.depth == 0).all())
     for name in PARAM_NAMES:
         assert torch.equal(getattr(leaves, name).grad, getattr(plain, name).grad), name
-
-
-def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
-    gaussians, frozen = random_gaussians(12), random_gaussians(9, seed=7)
-    leaves = as_leaves(gaussians)
-    naive = naive_rasterize(leaves, VIEW, sh_degree=1, frozen=frozen)
-    weights = probe(VIEW.height, VIEW.width)
-    (expected,) = torch.autograd.grad((stacked(naive) * weights).sum(), naive.means2d)
-
-    raster = drawn(EAGER, as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen)
-    info = raster.info
-    info["means2d"].retain_grad()
-    (stacked(raster) * weights).sum().backward()
-    assert info["means2d"].shape == (1, 12, 2)
-    assert relative_error(info["means2d"].grad[0], expected) < 1e-10
-    assert info["radii"].shape == (1, 12)
-    assert info["radii"][0].tolist() == naive.radii
-
-
-@pytest.mark.parametrize("with_frozen", [False, True])
-def test_no_gaussians(with_frozen):
-    nothing = as_leaves(Gaussians.empty(dtype=torch.float64))
-    frozen = random_gaussians(5) if with_frozen else None
-    raster = drawn(EAGER, nothing, VIEW, sh_degree=3, frozen=frozen)
-    raster.info["means2d"].retain_grad()
-    stacked(raster).sum().backward()
-    assert raster.info["means2d"].grad.shape == (1, 0, 2)
-    assert raster.color.shape == (VIEW.height, VIEW.width, 3)
-    assert bool((raster.transmittance == 1).all()) is not with_frozen
 
 
 def test_what_cannot_be_seen_leaves_nothing_and_no_gradient_breaks():

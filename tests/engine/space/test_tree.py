@@ -238,14 +238,6 @@ def test_order_is_right_in_exact_arithmetic(seed, num_blocks):
         assert places == sorted(places)
 
 
-def test_a_camera_on_the_plane_belongs_to_the_right():
-    tree = build_grid(torch.zeros(0, 3), counts=(2, 1, 1))
-    threshold = float(tree.threshold[0])
-    center = torch.tensor([threshold, 0.0, 0.0], dtype=torch.float64)
-    assert front_to_back(tree, center) == (1, 0)
-    assert front_to_back(tree, torch.nextafter(center, center - 1)) == (0, 1)
-
-
 @given(SEEDS, st.integers(1, 12), st.floats(-3, 3).filter(lambda t: t * 4 != round(t * 4)))
 def test_json_round_trip_is_exact(seed, num_blocks, threshold):
     tree = random_tree(seed, num_blocks)

@@ -30,23 +30,6 @@ from tests.reference.scenes import (
 BOTH = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 
 
-@BOTH
-def test_training_improves_every_photo(make, views, photos, primitive):
-    coordinator = make(blocks=4, steps=60, background="black", primitive=primitive)
-
-    def error() -> torch.Tensor:
-        draw, scene = coordinator.run.rasterizer, whole_scene(coordinator)
-        with torch.no_grad():
-            pictures = [draw(scene, view, sh_degree=1).color.clamp(0, 1) for view in views]
-        pairs = zip(pictures, views, strict=True)
-        return torch.stack([(p - photos.images[v.index]).square().mean() for p, v in pairs])
-
-    before = error()
-    train(coordinator, photos)
-    assert coordinator.state.step == 60
-    assert bool((error() < 0.9 * before).all()), (before, error())
-
-
 @pytest.mark.parametrize(("growing", "layers"), [(True, True), (False, False)], ids=["growing", "ablated"])
 def test_one_block_is_plain_3dgs_bit_for_bit(make, views, photos, start, growing, layers):
     density = replace(GROWING, min_contribution=0.0) if growing else STILL
@@ -234,21 +217,6 @@ def test_the_state_of_a_run_survives_json(make, photos):
     assert (again.health, again.influence, again.queue) == (state.health, state.influence, state.queue)
     assert again.active.looked_at == (2,)
     assert again.active.geometry.crops == state.active.geometry.crops
-
-
-@pytest.mark.parametrize(("pass_gaussians", "primitive"), [(30, "3dgs"), (0, "2dgs")])
-def test_the_sandwich_of_a_sample_is_the_merged_picture(make, views, start, pass_gaussians, primitive):
-    """What a step sees of the scene, before any training, is what a viewer would see."""
-    options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians, "primitive": primitive}
-    double = [view.to(torch.float64) for view in views]
-    coordinator = make(start=start.to(torch.float64), views=double, blocks=4, **options)
-    for _ in range(4):
-        batch = coordinator.next_batch()
-        assert 1 < len(batch.samples) <= coordinator.batch
-        rendered = coordinator.render(batch)
-        assert all(float(off.max()) < 1e-9 for off in off_from_merged(coordinator, batch, rendered.pictures))
-        assert all(sample.layers is not None for sample in batch.samples)
-        coordinator.after_step(rendered)
 
 
 def off_from_merged(coordinator, batch, pictures) -> list[torch.Tensor]:

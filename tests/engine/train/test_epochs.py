@@ -134,14 +134,6 @@ def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make,
     assert [len(found) for found in counts[False].values()] == [1, 1]
 
 
-def test_fixed_steps_for_each_cell_are_one_visit_to_each(make, photos):
-    coordinator = make(blocks=4, steps=20, visit_steps=5, batch=1, density=STILL)
-    begun = listen(coordinator, VisitBegan)
-    train(coordinator, photos)
-    assert [event.steps for event in begun] == [5] * 4
-    assert {event.block for event in begun} == {0, 1, 2, 3}
-
-
 @pytest.mark.parametrize("keep", [True, False])
 def test_moments_are_forgotten_at_the_next_visit_only_when_asked(make, photos, keep):
     coordinator = make(blocks=2, steps=30, visit_steps=3, batch=1, density=STILL, keep_moments=keep)

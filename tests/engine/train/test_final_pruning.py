@@ -7,12 +7,10 @@ import torch
 
 from abcd_ns.engine.events import PrunedAtEnd, Pruning
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import final_pruning
-from abcd_ns.engine.train.step.final_pruning import FinalPruning, _Probe, random_signs
-from abcd_ns.engine.train.step.layer_source import WholeViews
+from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, random_gaussians, whole_scene
@@ -193,23 +191,3 @@ def test_a_run_whose_time_is_up_between_two_looks_is_complete_all_the_same(begin
     coordinator.run.budget = Budget(steps=coordinator.state.step)
     train(coordinator, photos)
     assert len(told) == 1
-
-
-def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian(complete, views):
-    """In the mean over many signs, of a Gaussian at a time."""
-    coordinator, _ = complete(steps=5, density=replace(STILL, min_contribution=0.0))
-    everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, views[0]
-    whole = WholeViews(coordinator.run, lambda _: None)
-    probed, signs = _Probe(), random_signs(0)
-    pictures = whole.pictures([view], ChangedScene(coordinator.scene, probed.with_leaf))
-    times = 400
-    for _ in range(times):
-        pictures.backward([view], lambda _, picture: signs(picture.color.shape).to(picture.color))
-        probed.accumulate()
-    found = probed.worth(0, coordinator.scene) / times
-    with torch.no_grad():
-        before = draw(everything, view, sh_degree=1).color
-        for row in found.argsort(descending=True)[:10].tolist():
-            others = torch.arange(len(everything)) != row
-            missing = (draw(everything[others], view, sh_degree=1).color - before).square().sum()
-            assert float(found[row]) == pytest.approx(float(missing), rel=0.3)

@@ -1,12 +1,9 @@
 """An option that changes nothing is a fault: each changes what is learnt, but for those that say so."""
 
-import dataclasses
-
 import pytest
 
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.train import schedule
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
@@ -39,8 +36,6 @@ OTHERS_OF_DENSITY = {
 }
 NOT_LEARNT = {"recipe", "limits", "density", "commit_seconds"}
 """What defines a method or follows from memory, the group tested beside, and when blocks are written."""
-OF_THE_POINTS = {"point_pixels"}
-"""Decides what a run begins with; see tests/nerfstudio/test_option_effects.py."""
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +93,3 @@ def test_what_contradicts_a_method_or_its_primitive_is_refused(option, others):
     training_config(**option).check()
     with pytest.raises(UserError, match=f"training.{next(iter(option))} is for "):
         training_config(**option, **others).check()
-
-
-def test_there_are_twenty_and_all_are_looked_at():
-    training, density = ({f.name for f in dataclasses.fields(c)} for c in (TrainingConfig, DensityConfig))
-    assert training == {*OTHERS, *NOT_LEARNT, *OF_THE_POINTS}
-    assert density == set(OTHERS_OF_DENSITY)
-    assert len(training - {"recipe", "limits", "density", "seed"}) + len(density) == 20

@@ -13,7 +13,6 @@ from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import ALIGN, Sample, part_to_draw, random_part
-from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, View
 from tests.reference.rasterizer_scenes import project
 from tests.reference.scenes import STILL, assert_resumes, random_gaussians, ring_of_views, training_config
@@ -183,13 +182,3 @@ def test_alpha_and_masks_are_reduced_with_what_they_stand_for():
     assert found.sum() == 5
     assert not found[0, 0]
     assert sample.reduced_mask(None) is None
-
-
-@pytest.mark.usefixtures("small_pictures")
-def test_samples_grow_with_the_run(make, photos):
-    coordinator, seen = make(blocks=1, steps=60, coarse=0.6), []
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        seen.append(coordinator.run.reduction)
-    assert {1, 2, 4} == set(seen)
-    assert seen == sorted(seen, reverse=True)
