@@ -38,7 +38,6 @@ def test_text_is_wrapped_and_errors_are_not():
 
 
 def names_in_code() -> set[str]:
-    """The name of every finding that check and doctor make."""
     nodes = (node for path in MAKERS for node in ast.walk(ast.parse(path.read_text())))
     calls = [(ast.unparse(node.func), node.args) for node in nodes if isinstance(node, ast.Call)]
     place = {"Finding": 1, "error": 0, "warning": 0, "note": 0}

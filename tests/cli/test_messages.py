@@ -23,7 +23,6 @@ ELSEWHERE = {"--ImageReader.single-camera", "--mask-color", "--at", "--output-pa
 
 
 def help_of(target: Any, columns: int, **options: Any) -> str:
-    """What a command says to --help."""
     text = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(text), suppress(SystemExit):
         patch.setenv("COLUMNS", str(columns))

@@ -27,12 +27,10 @@ def photos(views):
 
 
 def setup_of(run: TrainingRun) -> RunSetup:
-    """What workers need to know of a run."""
     return RunSetup.of(run, LayerRoom())
 
 
 def in_process(run: TrainingRun, photos: Photos, count: int) -> InProcessWorkers:
-    """So many workers of a run, in this process."""
     worker = VisitWorker(setup_of(run), TorchRasterizer(), lambda s: (photos(s.view.index, s.crop), None))
     return InProcessWorkers(worker, count)
 

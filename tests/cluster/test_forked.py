@@ -159,8 +159,6 @@ def test_what_is_paused_counts_for_no_visit():
 
 
 class Slow(TorchRasterizer):
-    """Takes its time to draw layers."""
-
     def cuts(self, *args, **options):
         for cut in super().cuts(*args, **options):
             time.sleep(0.4)

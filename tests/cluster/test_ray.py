@@ -66,7 +66,6 @@ def refuse():
 
 @pytest.fixture(scope="module")
 def traps(tmp_path_factory):
-    """See make_worker."""
     return tmp_path_factory.mktemp("traps")
 
 

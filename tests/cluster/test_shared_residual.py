@@ -16,19 +16,9 @@ from tests.cluster.conftest import setup_of
 from tests.cluster.in_process import InProcessWorkers
 from tests.reference.scenes import STILL, equal, whole_scene
 
-WEIGHTS = st.lists(st.floats(0, 1), min_size=2, max_size=6)
 INFLUENCE = st.dictionaries(
     st.integers(0, 5), st.dictionaries(st.integers(0, 3), st.floats(1e-6, 1), max_size=4), max_size=6
 )
-
-
-@given(weights=WEIGHTS)
-def test_shares_of_all_blocks_add_up_to_one(weights):
-    """But for what FAINT gives to each."""
-    weights = torch.tensor(weights, dtype=torch.float64) / len(weights)
-    found = sum(shares(own[None, None], weights.sum()[None, None], 1.0) for own in weights)
-    exact = (weights.sum() + len(weights) * FAINT) / (weights.sum() + FAINT)
-    assert float(found) == pytest.approx(float(exact))
 
 
 @given(own=st.floats(0, 1), more=st.floats(0, 1), beside=st.floats(0, 1))

@@ -88,7 +88,6 @@ def project_pycolmap(model: pycolmap.Reconstruction, name: str) -> np.ndarray:
 
 
 def refusal(data: Path, **options) -> str:
-    """The message that a scene is refused with."""
     with pytest.raises(InputError) as caught:
         parser(data, **options).get_dataparser_outputs()
     return str(caught.value)

@@ -34,7 +34,6 @@ def saved(path: Path, image: np.ndarray) -> Path:
 
 @pytest.fixture
 def sources(tmp_path: Path) -> list[PhotoSource]:
-    """Six photos at full size."""
     size = (WIDTH, HEIGHT)
     return [PhotoSource(saved(tmp_path / f"{i}.png", noise(i)), size, size) for i in range(6)]
 
@@ -280,7 +279,6 @@ LENSES = {
 
 
 def lens_pair(kind: str, width: int, height: int) -> tuple[Lens, pycolmap.Camera]:
-    """One lens as ours and as COLMAP's."""
     focals = [0.8 * width] if "RADIAL" in kind else [0.8 * width, 0.85 * width]
     center = [width / 2 + 1.25, height / 2 - 0.75]
     fisheye = kind.endswith("FISHEYE")

@@ -33,7 +33,6 @@ def drawn(monkeypatch) -> dict[str, list[str]]:
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch) -> FakeWorker:
-    """Does the jobs of experiments."""
     fake = FakeWorker(tmp_path / "worker")
     monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
     monkeypatch.setattr("abcd_ns.lab.runs.runner.describe_machine", lambda: MACHINE)

@@ -52,13 +52,10 @@ def train(
 
 
 class Trainings(Runs):
-    """Starts trainings in processes of their own."""
-
     body = staticmethod(train)
 
 
 def run_folder(out: Path) -> Path:
-    """Of the one run under `out`."""
     (folder,) = out.glob("*/abcd/run")
     return folder
 

@@ -8,7 +8,6 @@ from typing import Any
 
 
 def forget(*packages: str) -> None:
-    """Have modules loaded anew when they are asked for."""
     for module in [name for name in sys.modules if name.split(".")[0] in packages or name in packages]:
         del sys.modules[module]
 

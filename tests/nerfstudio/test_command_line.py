@@ -37,7 +37,6 @@ def test_train_then_evaluate(tmp_path):
 
 
 def test_an_option_that_is_none_here_is_one_line_before_nerfstudio_reads_any(monkeypatch, capsys):
-    """Any other such option is in test_options.py."""
     words = ["ns-train", "abcd", "--data", "x", "--pipeline.training.warmpu", "0.1"]
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(SystemExit) as ended:

@@ -46,7 +46,6 @@ METHODS = {
 
 
 def parsed(*words: str, method: str = "abcd"):
-    """What `ns-train` makes of its words."""
     return tyro.cli(AnnotatedBaseConfigUnion, args=[method, *words])
 
 

@@ -27,7 +27,6 @@ from tests.nerfstudio.test_training import configure, run
 
 @pytest.fixture(scope="module")
 def theirs(data, tmp_path_factory) -> AbcdTrainer:
-    """A run whose data nerfstudio's own reader has read."""
     config = configure(data, tmp_path_factory.mktemp("theirs"), steps=8)
     config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
     return run(config)

@@ -48,7 +48,6 @@ def stopped(broken_off, tmp_path) -> Path:
 
 
 def assert_same(found: Path, expected: Path) -> None:
-    """Both runs ended with the same scene."""
     mine, theirs = gaussians(found), gaussians(expected)
     assert mine.keys() == theirs.keys()
     assert all(torch.equal(mine[name], theirs[name]) for name in theirs)

@@ -23,8 +23,6 @@ from tests.nerfstudio.test_training import STEPS, configure, run
 
 @dataclass
 class FakeCoordinator:
-    """As much of a coordinator as a log asks for."""
-
     step: int = 0
     seconds: float = 0.0
     visit: int = 0

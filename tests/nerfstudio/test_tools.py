@@ -30,7 +30,6 @@ STEPS = 24
 
 @pytest.fixture(scope="module")
 def trained(data, tmp_path_factory) -> Path:
-    """The folder of a run."""
     return run(configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)).base_dir
 
 
@@ -57,7 +56,6 @@ def camera_path(folder: Path, **extra) -> Path:
 
 @pytest.fixture
 def rendered(trained, tmp_path, monkeypatch):
-    """Writes pictures of a camera path, and reads them."""
     monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)
 
     def draw(names: list[str], **extra) -> dict[str, np.ndarray]:

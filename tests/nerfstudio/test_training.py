@@ -46,7 +46,6 @@ def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS,
 
 
 def set_option(config, name: str, value: object) -> None:
-    """Set an option by its dotted name."""
     holder, *names = config, *name.split(".")
     for part in names[:-1]:
         holder = holder[part] if isinstance(holder, dict) else getattr(holder, part)

@@ -55,7 +55,6 @@ class Watched:
         self.trainer.train()
 
     def choose(self, label: str, value) -> None:
-        """As the user does with the control of this label."""
         control = self.browser.wait_for(lambda m: m.get("label") == label)
         self.browser.send({"type": "GuiUpdateMessage", "id": control["id"], "updates": {"value": value}})
 

@@ -22,7 +22,6 @@ from tests.reference.scenes import GROWING, STILL, assert_resumes, equal, listen
 
 @pytest.fixture
 def independent(make):
-    """Makes such runs."""
     given = {"overlap": 0.2, "layers": False, "migrate": False, "blocks": 4}
     given |= {"kind": independent_trainer, "content": independent_blocks}
     return lambda *args, **options: make(*args, **{**given, **options})

@@ -33,11 +33,9 @@ class Counts:
 
     @property
     def waited(self) -> int:
-        """Waits of all kinds."""
         return sum(self.waits.values())
 
     def copy(self) -> "Counts":
-        """What is counted so far."""
         return self.since(Counts())
 
     def since(self, earlier: "Counts") -> "Counts":
@@ -49,16 +47,13 @@ class Counts:
         return Counts(**{**values, **less})
 
     def reset_peak(self) -> None:
-        """Count the peak anew from here."""
         self.peak_bytes = self.live_bytes
 
     def wait(self, why: str) -> None:
-        """The host waits."""
         self.waits[why] += 1
         self.places[_place()] += 1
 
     def move(self, tensor: Tensor, *, to_device: bool, blocks: bool = True) -> None:
-        """A tensor is copied between host and device."""
         way = "to_device" if to_device else "to_host"
         setattr(self, f"copies_{way}", getattr(self, f"copies_{way}") + 1)
         setattr(self, f"bytes_{way}", getattr(self, f"bytes_{way}") + tensor.numel() * tensor.element_size())

@@ -72,7 +72,6 @@ def curve_of(method: str, folder: Path) -> dict[str, list[float]]:
 
 
 def main() -> None:
-    """Write all curves."""
     torch.set_num_threads(1)
     curves = {}
     for method in METHODS:

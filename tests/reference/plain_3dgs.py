@@ -62,7 +62,6 @@ def train_plain(
 
 
 def _rows(views: list[View], steps: int, config: TrainingConfig):
-    """(view, degree) of each step."""
     for taken in range(steps):
         degree = sh_degree_at(taken / steps, config.recipe.sh_ramp, config.sh_degree)
         yield endless_order(tuple(range(len(views))), taken, config.seed), degree

@@ -188,7 +188,6 @@ def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:
 
 
 def stop(trainer: Trainer) -> None:
-    """Save a run and let go of its folder."""
     trainer.save()
     trainer.close()
 

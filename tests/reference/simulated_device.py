@@ -48,11 +48,9 @@ class Event:
     _underway: ClassVar[list[tuple[Tensor, Tensor]]] = []
 
     def record(self, stream: None) -> None:  # noqa: ARG002 - there is one
-        """Here."""
         self._before, Event._underway = Event._underway, []
 
     def synchronize(self) -> None:
-        """Wait until the device has come here."""
         _counts.wait("event")
         _arrive(self._before)
 

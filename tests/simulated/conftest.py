@@ -14,14 +14,12 @@ __all__ = ["counts", "make", "on_device", "photos", "simulated_gsplat", "start",
 
 @pytest.fixture
 def counts():
-    """The simulated device, for the whole test."""
     with simulated_device() as counts:
         yield counts
 
 
 @pytest.fixture
 def simulated_gsplat(counts):
-    """The same, with gsplat's functions."""
     with lent():
         yield counts
 

@@ -20,7 +20,6 @@ STEPS = 14
 
 @pytest.fixture(scope="module", autouse=True)
 def counts():
-    """The simulated device, for the whole module."""
     with simulated_device() as counts, lent():
         yield counts
 

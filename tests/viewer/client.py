@@ -21,7 +21,6 @@ CAMERA = {
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -40,7 +39,6 @@ def ask(server: viser.ViserServer, path: str, **headers: str) -> bytes:
 
 
 def status(answer: bytes) -> int:
-    """The status of an answer."""
     return int(answer.split(b" ", 2)[1])
 
 
@@ -61,7 +59,6 @@ class Browser:
 
     @property
     def heard(self) -> int:
-        """How many messages came so far."""
         with self._news:
             return len(self.messages)
 
@@ -75,12 +72,10 @@ class Browser:
         return found
 
     def of(self, kind: str) -> list[dict[str, Any]]:
-        """All messages of a type so far."""
         with self._news:
             return [message for message in self.messages if message["type"] == kind]
 
     def close(self) -> None:
-        """Hang up."""
         self._socket.close()
         self._thread.join(timeout=20)
 

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -69,18 +68,6 @@ def test_time_left_is_that_of_steps_and_of_the_final_pruning():
     pruning = 0.1 * (12.5 + 0.5 * 7 * 5)  # 400 steps: 12.5 views rank, 5 tell
     assert texts.time_left(a_run(step=100, progress=0.25)) == pytest.approx(30.0 + pruning)
     assert texts.time_left(a_run(step=100, progress=1.0)) == pytest.approx(0.1 * (5 + 0.5 * 7 * 5))
-
-
-def test_words():
-    waiting = WorkerSeen(1, None, 0, 0, 0, 0, 0.0)
-    assert texts.worker_line(WorkerSeen(0, 2, 7, 40, 3, 1, 0.1)) == (
-        "Worker 1: block 3, step 7 of 40; 3 visits, replaced 1x"
-    )
-    assert texts.worker_line(waiting) == "Worker 2: is starting; 0 visits"
-    assert (texts.clock(3725.9), texts.clock(None)) == ("1:02:05", "unknown")
-    assert texts.memory_table([("RAM", 3 * 2**29, 2**34)]).splitlines()[2:] == [
-        "| RAM | 1.5 GiB | 16.0 GiB |"
-    ]
 
 
 @pytest.mark.parametrize("mark", [None, "a file", "Kubernetes"])

@@ -32,7 +32,6 @@ def names(found: Survey) -> set[str]:
 
 
 def the(name: str, found: Survey) -> Finding:
-    """The one finding of that name."""
     (finding,) = (finding for finding in doubts(found) if finding.name == name)
     return finding
 
@@ -53,5 +52,4 @@ def changed(found: Survey, pose: Callable | None = None, points: np.ndarray | No
 
 
 def with_brightness(found: Survey, *brightness: float) -> Survey:
-    """The survey of photos that are so bright."""
     return replace(found, looks=tuple(map(Look, brightness)))

@@ -74,14 +74,12 @@ def page_of(tmp_path, held_out: HeldOut | None = None, notes=(), **settings) -> 
 
 
 def with_lines(run: RunFolder, *more: str) -> RunFolder:
-    """The run with more lines in its log."""
     log = write_log(run.path / "longer.jsonl", [*log_lines(), *more])
     return dataclasses.replace(run, story=read_story(log))
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> tuple[str, Page]:
-    """The page of a run, with pictures."""
     return page_of(tmp_path_factory.mktemp("page"), made_up_held_out())
 
 

@@ -18,8 +18,6 @@ BLOCK = 5
 
 
 class Watched(MemoryScene):
-    """Notes each block of which something was read."""
-
     def drawn(self, block, device, which=None):
         self.read.append(block)
         return super().drawn(block, device, which)

@@ -52,7 +52,6 @@ def own_library(tmp_path, monkeypatch):
 
 @pytest.fixture
 def threads():
-    """Sets the number of threads, for the test."""
     yield library().abcd_threads
     library().abcd_threads(threads_wanted())
 

@@ -1,4 +1,4 @@
-"""gsplat's reference against the torch rasterizer, and the gsplat backend's own logic with CPU stand-ins."""
+"""The gsplat backend's own logic, and the torch rasterizer, against stand-ins for gsplat's kernels."""
 
 from dataclasses import replace
 
@@ -26,7 +26,6 @@ VIEW = small_view(70, 45)
 
 @pytest.fixture(params=["3dgs", "2dgs"])
 def backend(request):
-    """A GsplatRasterizer on CPU stand-ins."""
     with lent():
         yield GsplatRasterizer(request.param)
 

@@ -22,8 +22,6 @@ def no_gradient(gaussians: Gaussians) -> Gaussians:
 
 
 class Broken(TorchRasterizer):
-    """A torch backend with a fault in one place."""
-
     def __init__(self, fault: str) -> None:
         super().__init__(use_native=False)
         self.name, self.fault = "broken", fault

@@ -12,10 +12,8 @@ from abcd_ns.engine.space.influence import (
     coarser,
     influence,
     overlaps,
-    share_shown,
     visible_blocks,
     weights,
-    weights_by_pixel,
     worth_training,
 )
 from abcd_ns.engine.space.partition import build_kd
@@ -59,27 +57,6 @@ def test_large_views_are_looked_at_in_small_pictures():
     assert set(sizes) == {(80, 60)}
     full = weights(gaussians, TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)])
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
-
-
-def test_what_stands_in_front_takes_its_share(rasterizer):
-    gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
-    shot = Shot(view, view.full)
-    (bare,) = weights(gaussians, rasterizer, [shot])
-    whole = share_shown(gaussians, rasterizer, shot, None)
-    half = share_shown(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
-    assert whole == pytest.approx(float(bare.sum()) / view.full.pixels, abs=2e-6)
-    assert half == pytest.approx(whole / 2, abs=2e-6)
-    assert whole > 1e-3
-
-
-def test_weights_by_pixel_are_what_is_painted_white_among_what_is_frozen(rasterizer):
-    gaussians, (view,) = random_gaussians(80, seed=4, size=0.15), ring_of_views(1)
-    chosen = torch.arange(80) % 3 == 0
-    frozen = rasterizer.project(gaussians[~chosen], view)
-    found = weights_by_pixel(gaussians[chosen], rasterizer, Shot(view, view.full, frozen))
-    picture = rasterizer(painted(gaussians, chosen), view, sh_degree=0)
-    assert torch.allclose(found, picture.color[..., 0], atol=1e-6)
-    assert float(found.max()) > 0.5
 
 
 def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer):

@@ -15,7 +15,6 @@ def runs() -> Runs:
 
 @pytest.fixture(scope="module")
 def undisturbed(runs, tmp_path_factory):
-    """The folder of a run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("undisturbed")
     assert runs.finish(folder) == 0
     assert ParameterStore.open(folder / "store", read_only=True).state["step"] == STEPS

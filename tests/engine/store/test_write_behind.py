@@ -55,7 +55,6 @@ def persist_aside(scene: StoredScene, *args) -> threading.Thread:
 
 
 def hold_up(scene: StoredScene, disk: Disk, step: int, block: int) -> None:
-    """Have a write begin, and take its time."""
     disk.free.clear()
     persist(scene, step, block, within=SOON)
     assert disk.asked.wait(PATIENCE)

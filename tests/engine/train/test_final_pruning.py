@@ -30,7 +30,6 @@ def scene() -> Gaussians:
 
 @pytest.fixture
 def begin(make, photos):
-    """Makes runs of the scene that know their photos."""
     given = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "background": "black"}
     given["target"] = lambda sample: (photos(sample.view.index, sample.crop), None)
 
@@ -42,8 +41,6 @@ def begin(make, photos):
 
 @pytest.fixture
 def complete(begin, photos):
-    """Makes such a run, completes it, and gives it with what it said."""
-
     def completed(*args, **options):
         run = begin(*args, **options)
         told = listen(run, object)

@@ -33,8 +33,6 @@ def begin(make):
 
 @pytest.fixture
 def grown(begin, photos):
-    """Makes them, and trains the warm-up."""
-
     def made(**options):
         coordinator = begin(**options)
         train(coordinator, photos, steps=12)

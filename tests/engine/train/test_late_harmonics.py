@@ -18,7 +18,6 @@ def start(start):
 
 
 def highest_of(coordinator) -> int:
-    """Degree of harmonics that any Gaussian has."""
     return int(degrees_in_use([whole_scene(coordinator).features_rest]).max())
 
 

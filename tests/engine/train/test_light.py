@@ -27,8 +27,6 @@ IDENTITY = torch.eye(3, 4)
 
 
 class Drifting(Photos):
-    """Photos whose exposure changes from one to the next."""
-
     def __call__(self, index, crop):
         return (GAINS[index % 3] * super().__call__(index, crop)).clamp(0, 1)
 
@@ -45,7 +43,6 @@ def drifting(ring):
 
 @pytest.fixture
 def make(make, ring):
-    """Makes runs that begin with the truth."""
     return partial(make, start=TRUTH, views=ring, density=STILL)
 
 

@@ -33,8 +33,6 @@ path.with_name("run.json").write_text(json.dumps(run))
 
 
 class FakeWorker:
-    """A worker process that trains nothing and does what it is told."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
@@ -50,7 +48,6 @@ class FakeWorker:
 
     @property
     def command(self) -> tuple[str, ...]:
-        """What starts it."""
         return (sys.executable, str(self.folder / "worker.py"))
 
     def calls(self) -> list[str]:

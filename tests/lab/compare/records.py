@@ -51,26 +51,22 @@ def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: 
 
 
 def made_up_settings(**fields) -> Settings:
-    """Those of a run of a minute."""
     values = {"data": "made-up", "downscale": 4, "blocks": 8, "seconds": 60.0, "steps": None, "evals": 6}
     return Settings(**{**values, "pictures": 3, **fields})
 
 
 def made_up(kind: str, *arms: Arm, **fields) -> Results:
-    """Results with these arms, and what they say."""
     values = {"settings": made_up_settings(), "seeds": (0,), "arms": arms, **fields}
     results = Results(SCHEMA, kind, "2026-01-01T00:00:00+00:00", "abcd", MACHINE, VERSIONS, **values)
     return dataclasses.replace(results, findings=findings_of(results))
 
 
 def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
-    """An arm whose runs end at `psnrs`, by seed."""
     runs = (made_up_run(method, seed, psnr_merged=psnr, psnr=psnr, **fields) for seed, psnr in psnrs.items())
     return Arm(method, variant, value, tuple(runs))
 
 
 def made_up_results(*runs: Run, **fields) -> Results:
-    """A comparison with these runs."""
     methods = dict.fromkeys(run.method for run in runs)
     arms = [Arm(m, "default", None, tuple(run for run in runs if run.method == m)) for m in methods]
     failure = Failure("abcd-ablated", 0, "it broke", "runs/abcd-ablated/seed-0/log.txt")

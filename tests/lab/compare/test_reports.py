@@ -20,7 +20,6 @@ from tests.lab.compare.records import made_up, made_up_arm, made_up_results, mad
 
 
 def counted(*counts: int, **fields):
-    """A run whose curve holds these numbers of Gaussians."""
     base = made_up_run(**fields)
     curve = base.curve[: len(counts)]
     points = [dataclasses.replace(p, gaussians=n) for p, n in zip(curve, counts, strict=True)]

@@ -28,7 +28,6 @@ def plan(tmp_path) -> Plan:
 
 
 def run(plan: Plan, overwrite: bool = False) -> list[Run | Failure]:
-    """What comes of the plan's jobs, in their order."""
     *_, results = run_jobs(plan, Console(file=StringIO()), overwrite)
     found = {(one.method, one.seed): one for one in (*results.runs, *results.failures)}
     return [found[job.method, job.seed] for job in plan.jobs]
