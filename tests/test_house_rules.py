@@ -1,7 +1,4 @@
-"""The rules of the house (CONTRIBUTING.md), as far as a machine can check them and ruff does not.
-
-Every rule is a function from source text to complaints, so that each is first shown to notice an offence.
-"""
+"""The rules of the house (CONTRIBUTING.md), as far as a machine can check them and ruff does not."""
 
 import ast
 import re
@@ -167,35 +164,6 @@ def text_files() -> list[Path]:
 def test_the_house_is_clean(rule, paths):
     assert paths
     assert complaints(rule, paths) == []
-
-
-@pytest.mark.parametrize(
-    ("rule", "offence"),
-    [
-        (file_length, "\n" * (MAX_FILE_LINES + 1)),
-        (function_length, "def f():\n" + "    1\n" * MAX_FUNCTION_LINES),
-        (skips_have_reasons, "@pytest.mark.skip\ndef test(): pass"),
-        (skips_have_reasons, "pytest.skip()"),
-        (skips_have_reasons, "pytest.mark.skipif(True)"),
-        (machine_independent, "see /home/me/scene"),
-        (no_index_hosts, "--index-url https://mirror"),
-        (no_circular_nerfstudio_imports, "from nerfstudio.configs.method_configs import all_methods"),
-        (unsafe, "import pickle"),
-        (unsafe, "from pickle import loads"),
-        (unsafe, "def f():\n    import joblib"),
-        (unsafe, "from urllib import request"),
-        (unsafe, "import requests"),
-        (unsafe, "torch.load(path)"),
-        (unsafe, "torch.load(path, weights_only=False)"),
-        (unsafe, "np.load(path, allow_pickle=True)"),
-        (unsafe, "yaml.load(text, Loader=yaml.Loader)"),
-        (unsafe, "eval(text)"),
-        (unsafe, "subprocess.run(command, shell=True)"),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_each_rule_notices_an_offence(rule, offence):
-    assert len(list(rule(offence))) == 1
 
 
 def entry_points() -> list[str]:

@@ -3,11 +3,9 @@
 from dataclasses import asdict
 
 import pytest
-import torch
 from rich.console import Console
 
-from abcd_ns.errors import UserError
-from abcd_ns.lab.results.records import read_json, write_json
+from abcd_ns.lab.results.records import encode, read_json, write_json
 from abcd_ns.lab.results.results import Arm
 from benchmarks import gpu
 from benchmarks.gpu import Args, main, show
@@ -55,18 +53,6 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
     assert "is there; --again" in capsys.readouterr().out
     assert main(Args(again=True, **args)) == 0
     assert ran == ["build", "build"]
-
-
-def test_without_a_cuda_device_it_says_so(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert main(Args(out=tmp_path / "out")) == 2
-    assert "There is no CUDA device" in capsys.readouterr().out
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_comparison_without_a_scene_is_refused(tmp_path):
-    with pytest.raises(UserError, match="--data"):
-        main(Args(out=tmp_path / "out", dry_run=True))
 
 
 def test_every_record_is_shown(tmp_path, capsys):

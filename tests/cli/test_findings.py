@@ -12,7 +12,6 @@ from abcd_ns.cli.findings import Finding, print_findings
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
 MAKERS = [*(ROOT / "abcd_ns/cli/check").glob("*.py"), *(ROOT / "abcd_ns/cli/doctor").glob("*.py")]
-LONG = "A sentence of many words that says what was found and why it matters. " * 3
 
 
 def printed(*findings: Finding, width: int = 80) -> list[str]:
@@ -27,14 +26,6 @@ def test_groups_are_titled_and_long_ones_cut():
     assert lines[:5] == ["", "error", "  e: Bad.", "", "notes (31)"]
     assert lines[5] == f"  n: {name}"  # names of files are no markup
     assert lines[24:] == ["  18: Too.", "  ... and 11 more (31 in all)."]
-
-
-def test_text_is_wrapped_and_errors_are_not():
-    warning = printed(Finding("warning", "w", LONG, LONG))
-    assert max(map(len, warning)) <= 80
-    assert sum(line.startswith("    -> ") for line in warning) == 1
-    assert all(line.startswith("    ") for line in warning[3:])
-    assert len(printed(Finding("error", "e", LONG.strip()))) == 3
 
 
 def names_in_code() -> set[str]:

@@ -117,20 +117,16 @@ def test_plan_and_check_take_what_training_takes(tmp_path, capsys, photos, point
     assert "does not fit" not in said
 
 
-def test_the_screen_is_short_and_says_more_when_asked(capsys):
-    found = planned(Wanted(blocks=4))
-    print_forecast(found, Console(width=120))
+def test_the_screen_says_more_when_asked(capsys):
+    found = dataclasses.replace(planned(Wanted(blocks=4)), seconds_per_step=12.0, factor=4)
+    print_forecast(found, Console(width=200))
     short = capsys.readouterr().out
-    assert len(short.splitlines()) < 10
-    for word in ("blocks", "400 points", "time", "device", "RAM", "disk", "All of it fits"):
-        assert word in short
-    long = dataclasses.replace(found, seconds_per_step=12.0, factor=4)
-    print_forecast(long, Console(width=200), verbose=True)
+    print_forecast(found, Console(width=200), verbose=True)
     shown = capsys.readouterr().out
     for what in itertools.chain(*found.shares.values()):
         assert what in shown
         assert what not in short
-    for word in ("points by block", "note: This may take 24 days", "max-seconds 7200", "--downscale 8"):
+    for word in ("This may take 24 days", "max-seconds 7200", "--downscale 8"):
         assert word in shown
 
 

@@ -3,16 +3,13 @@
 import json
 import math
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
-from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -77,21 +74,6 @@ def test_poses_go_back_to_original_coordinates(tmp_path):
     assert np.abs(moved - outputs.metadata["points3D_xyz"].numpy()).max() < 1e-6
 
 
-def test_default_frame_is_nerfstudios(scene):
-    """Against nerfstudio's own COLMAP parser, which works in float32."""
-    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-
-    theirs = ColmapDataParserConfig(
-        data=scene, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"
-    )
-    theirs = theirs.setup().get_dataparser_outputs()
-    ours = parser(scene, eval_mode="all").get_dataparser_outputs()
-    order = [theirs.image_filenames.index(path) for path in ours.image_filenames]
-    assert torch.allclose(ours.cameras.camera_to_worlds, theirs.cameras.camera_to_worlds[order], atol=1e-5)
-    assert torch.allclose(ours.dataparser_transform.float(), theirs.dataparser_transform, atol=1e-5)
-    assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-5)
-
-
 @given(count=st.integers(2, 60), interval=st.integers(2, 12), share=st.floats(0.5, 0.9))
 @settings(derandomize=True, max_examples=40, deadline=None)
 def test_splits_partition_the_views(count, interval, share):
@@ -125,18 +107,6 @@ def test_model_is_found_without_a_flag(tmp_path, folder):
     assert len(parser(tmp_path).get_dataparser_outputs().image_filenames) == 8
 
 
-def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
-    before = sorted(scene.rglob("*"))
-    outputs = parser(scene, downscale_factor=2).get_dataparser_outputs()
-    dataset = AbcdDataset(outputs)
-    for i in range(len(dataset)):
-        data = dataset.get_data(i, image_type="uint8")
-        camera = dataset.cameras[i]
-        assert data["image"].shape == (camera.height.item(), camera.width.item(), 3)
-        assert torch.equal(dataset[i]["image"], data["image"].float() / 255)
-    assert sorted(scene.rglob("*")) == before
-
-
 def test_zero_distortion_is_a_pinhole(tmp_path):
     write_capture(tmp_path, params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.0, 0.0, 0.0, 0.0]))
     outputs = parser(tmp_path).get_dataparser_outputs()
@@ -166,12 +136,6 @@ def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
     write_photos(scene / "images_2", divide=2)
     assert parser(scene, downscale_factor=1).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 2
     assert parser(scene, downscale_factor=4).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 4
-
-
-def test_photos_without_pose_are_mentioned(scene, capsys):
-    Image.new("RGB", (9, 9)).save(scene / "images/extra.png")
-    parser(scene).get_dataparser_outputs()
-    assert "1 photos in" in capsys.readouterr().out
 
 
 # transforms.json

@@ -68,12 +68,8 @@ def test_a_file_that_is_no_scene_is_answered_by_what_to_do_with_it(tmp_path, nam
     said = refusal(tmp_path / name)
     assert re.search(f"{name} is a file.*{fix}", said)
     assert f"{name}/images" not in said
-
-
-@pytest.mark.parametrize(("name", "fix"), [("walk.mov", "ffmpeg"), ("scan.zip", "unpack")])
-def test_a_folder_with_a_video_or_an_archive_alone_is_answered_by_what_to_do_with_it(tmp_path, name, fix):
-    (tmp_path / name).write_bytes(b"x")
-    assert fix in refusal(tmp_path)
+    if name in ("walk.MP4", "scan.zip"):  # alone in a folder
+        assert fix.split()[0] in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("gone", ["cameras", "images"])

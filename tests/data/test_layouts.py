@@ -39,13 +39,6 @@ def write_blender(folder: Path, splits: tuple[str, ...] = ("train", "val", "test
 # Photos and masks elsewhere
 
 
-def test_photos_may_lie_in_another_folder(scene):
-    (scene / "images").rename(scene / "undistorted")
-    outputs = parser(scene, images_path=Path("undistorted")).get_dataparser_outputs()
-    assert {path.parents[1] for path in outputs.image_filenames} == {scene / "undistorted"}
-    assert "images is missing" in refusal(scene)
-
-
 @pytest.mark.parametrize("called", ["{stem}.png", "{name}.png", "{name}"])
 def test_masks_of_a_colmap_model_are_found_by_name(scene, called):
     for i, name in enumerate(NAMES):

@@ -53,6 +53,10 @@ def test_the_camera_model_is_taken_at_either_level(scene, where, values, fisheye
         ({"ftheta_p0": 1.0}, "ftheta_p0"),
         ({"latlong": True}, "latlong"),
         ({"rolling_shutter": [0, 0, 0.01]}, "rolling_shutter"),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "p1": 0.2, "p2": 0.1},
+            "p1 = 0.2, p2 = 0.1, which no fisheye has",
+        ),
     ],
 )
 def test_what_is_not_read_is_refused_by_name_in_one_line(scene, where, values, named):
@@ -111,9 +115,3 @@ def test_a_frame_has_the_last_word_however_it_is_spelled(scene):
             assert (lens.fisheye, lens.distortion[0], lens.fx) == (False, 0.1, pytest.approx(lens.width / 2))
         else:
             assert (lens.fisheye, lens.distortion[0]) == (True, 0.3)
-
-
-@WHERE
-def test_a_fisheye_has_no_tangential_distortion(scene, where):
-    values = {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "p1": 0.2, "p2": 0.1}
-    assert "p1 = 0.2, p2 = 0.1, which no fisheye has" in refusal(with_camera(scene, where, values))

@@ -228,13 +228,6 @@ def test_every_option_of_splatfactos_model_is_a_flag_or_refused_by_a_reason():
         assert name in UNUSED_OF_MODEL or name in MIRRORED, name
 
 
-def test_what_ns_render_sets_is_let_be():
-    config = copy.deepcopy(METHODS["abcd"])
-    config.pipeline.model.eval_num_rays_per_chunk = 1
-    mirror(config.pipeline.training, config.pipeline.model)
-    assert config.pipeline.training == METHODS["abcd"].pipeline.training
-
-
 def test_any_reader_of_nerfstudios_is_named_as_with_splatfacto(capsys):
     words = ("--data", "x", "colmap", "--colmap-path", "sparse/0", "--downscale-factor", "2")
     refuse_flags(words, METHODS["abcd"])

@@ -270,14 +270,6 @@ def test_a_second_run_in_a_folder_is_refused_until_the_first_is_gone(data, stopp
     assert f"holds a run already: add --load-dir {stopped}" in said
 
 
-def test_a_damaged_store_is_named(data, stopped, tmp_path, capsys):
-    for path in (stopped / "abcd" / "store").glob("block-*"):
-        content = path.read_bytes()
-        path.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
-    said = refusal(configure(data, tmp_path / "b", load_dir=stopped), capsys, late=True)
-    assert "is damaged: its checksum is wrong. Go back to a pinned generation" in said
-
-
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [

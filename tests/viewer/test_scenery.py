@@ -16,6 +16,7 @@ from abcd_ns.viewer.scenery import (
     bulk,
     edges_of,
     first_look,
+    nearest_view,
     views_that_see,
 )
 from tests.reference.scenes import ring_of_views
@@ -69,6 +70,15 @@ def test_a_line_follows_all_edges_and_nothing_else():
     assert len(edges) == 12
     assert all(sum(a != b for a, b in zip(*edge, strict=True)) == 1 for edge in edges)
     assert set(line) == set(itertools.product((0, 10), (0, 20), (0, 30)))
+
+
+def test_the_nearest_view_is_close_and_looks_the_same_way():
+    views = ring_of_views(8)
+    for view in views:
+        eye, forward = (view.center * SCENE_SCALE).numpy(), view.viewmat[2, :3].numpy()
+        assert nearest_view(0.9 * eye, forward, views).index == view.index
+    assert nearest_view(0 * eye, forward, views).index == view.index  # in the middle the direction decides
+    assert nearest_view(eye, forward, []) is None
 
 
 def test_views_that_see():

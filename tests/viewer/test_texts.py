@@ -27,20 +27,6 @@ def test_a_block_is_untrained_then_active_then_done():
     assert statuses(state) == [Status.WARM_UP] * 5
 
 
-def test_the_table_has_no_columns_that_nothing_is_known_of():
-    rows = [BlockRow(0, Status.DONE, 1234, 15.0, 9), BlockRow(1, Status.UNDER_OBSERVED, 5, None, 1)]
-    assert texts.block_table(rows).splitlines()[2:] == [
-        "| 1 | done | 1,234 | 15.00 | 9 |",
-        "| 2 | under-observed | 5 | - | 1 |",
-    ]
-    finished = [BlockRow(0, Status.DONE, 7, None, None)]
-    assert texts.block_table(finished).splitlines() == [
-        "| # | state | Gaussians |",
-        "| ---: | --- | ---: |",
-        "| 1 | done | 7 |",
-    ]
-
-
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
     urgent = {70: Status.UNDER_OBSERVED, 90: Status.ACTIVE}
     rows = [BlockRow(b, urgent.get(b, Status.UNTRAINED), 1, None, 9) for b in range(100)]

@@ -3,13 +3,33 @@
 from dataclasses import replace
 
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.footprints import CROP_MARGIN, footprints
+from abcd_ns.engine.layers.footprints import CROP_MARGIN, extent_of_most, footprints
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.types import Gaussians
+from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
+
+
+@given(SEEDS, st.integers(1, 12), st.integers(1, 9), st.floats(0.0, 1.0))
+def test_beyond_each_side_lies_a_quarter_of_what_may_be_missed_and_one_step_more_is_too_much(
+    seed, width, height, share
+):
+    generator = torch.Generator().manual_seed(seed)
+    weight = torch.rand(height, width, generator=generator, dtype=torch.float64) ** 4
+    spared = (1 - share) / 4 * float(weight.sum())
+    left, top, right, bottom = map(int, extent_of_most(weight, share).tolist())
+    beyond = (weight[:, :left], weight[:top], weight[:, right:], weight[bottom:])
+    more = (weight[:, : left + 1], weight[: top + 1], weight[:, right - 1 :], weight[bottom - 1 :])
+    for missed, next_ones in zip(beyond, more, strict=True):
+        assert float(missed.sum()) <= spared + 1e-12
+        assert float(next_ones.sum()) > spared - 1e-12
+    if share > 0.5:
+        assert float(weight[top:bottom, left:right].sum()) >= share * float(weight.sum()) - 1e-12
 
 
 def cluster_and_veil(opacity: float) -> Gaussians:

@@ -76,6 +76,26 @@ def test_windows_follow_one_another_in_front_to_back_order(seed, dtype):
     assert bool((at == math.inf).all())
 
 
+@given(SEEDS, DTYPES)
+def test_the_window_is_the_one_of_the_cell_that_holds_the_point(seed, dtype):
+    """Checked in float64 a little away from the planes, where rounding cannot matter."""
+    view = random_view(seed, dtype)
+    tree = tree_around(seed, view)
+    near, far = leaf_windows(tree, view)
+    z = 10 ** torch.empty(5, 6, dtype=dtype).uniform_(-2, 1, generator=torch.Generator().manual_seed(seed))
+    inverse = torch.linalg.inv(view.viewmat.double())
+    for row in range(5):
+        for column in range(6):
+            pixel = torch.tensor([column + 0.5, row + 0.5, 1.0], dtype=torch.float64)
+            in_camera = torch.linalg.inv(view.K.double()) @ pixel * z[row, column]
+            point = inverse[:3, :3] @ in_camera + inverse[:3, 3]
+            inner = tree.axis >= 0
+            if (point[tree.axis[inner]] - tree.threshold[inner]).abs().min() < 1e-4:
+                continue
+            block = int(tree.assign(point[None]))
+            assert near[block, row, column] <= z[row, column] < far[block, row, column]
+
+
 @given(SEEDS, DTYPES, st.integers(0, 5), st.integers(0, 4), st.sampled_from([1, 2, 4]))
 def test_a_crop_of_the_windows_is_the_windows_of_the_crop(seed, dtype, x, y, side):
     view = random_view(seed, dtype)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.visibility import bounds_of
@@ -259,17 +259,6 @@ def test_pending_migrants_are_drawn_survive_a_stop_and_join(make, photos):
 
 
 # One block's visit, which lasts as long as the run
-
-
-def test_one_block_is_one_visit(make, photos):
-    coordinator = make(blocks=1, steps=50, commit_seconds=60.0)
-    disk, events = Disk(coordinator.scene.store), listen(coordinator, object)
-    train(coordinator, photos)
-    (begun,) = (event for event in events if isinstance(event, VisitBegan))
-    (ended,) = (event for event in events if isinstance(event, VisitEnded))
-    assert (begun.steps, begun.views, ended.block) == (50, 5, 0)
-    assert [event.epoch for event in events if isinstance(event, EpochEnded)] == [0]
-    assert [(written, state["step"]) for written, state in disk.commits] == [({0}, 50)]
 
 
 def test_a_long_visit_is_saved_by_the_clock(make, photos):

@@ -11,9 +11,9 @@ from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import shown
 from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Plan
-from abcd_ns.lab.results.results import TERRAIN, ViewScore
+from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
-from abcd_ns.lab.results.tables import findings_of, notes, print_rows, rows, write_table
+from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
 from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
 
 # The charts
@@ -126,29 +126,11 @@ def test_terminal_shows_whole_numbers_however_narrow_it_is():
     assert console.width == 60
 
 
-def test_notes_say_what_is_missing_and_why():
-    single = made_up_run("abcd-monolithic", ordering_gap_db=None, ordering_gap_note="one block")
-    text = "\n".join(notes(made_up_results(single)))
-    for part in (
-        "no weights",
-        "no CUDA device",
-        "splatfacto is left out: it needs a CUDA device",
-        "abcd-ablated, seed 0 failed (runs/abcd-ablated/seed-0/log.txt): it broke",
-        "abcd-monolithic: no ordering gap (one block)",
-        "60 s of training a run, seed 0",
-    ):
-        assert part in text
-
-
 def test_runs_of_several_versions_are_told():
     old = made_up_run("abcd-monolithic")
     old = dataclasses.replace(old, versions=dataclasses.replace(old.versions, commit="0123456789"))
     assert any("several versions" in line for line in notes(made_up_results(made_up_run(), old)))
     assert not any("several versions" in line for line in notes(made_up_results(made_up_run())))
-
-
-def test_growth_with_size_is_said_of_two_sizes_and_more():
-    assert findings_of(dataclasses.replace(made_up_results(), kind=TERRAIN)) == ()
 
 
 # Pictures

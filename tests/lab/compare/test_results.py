@@ -37,19 +37,15 @@ def test_no_number_that_json_lacks_is_written_or_read(tmp_path, number):
     [
         ('"schema": 2', '"schema": 3', "has schema 3"),
         ('"psnr": 23.5', '"psnr": "24"', r"Expected float, got str - at arms\[0\]\.runs\[0\]\.psnr"),
-        ('"psnr": 23.5', '"psnr": null', "Expected float, got null"),
-        ('"steps": 600', '"steps": 1.5', "Expected int, got float"),
-        ('"steps": 600', '"steps": true', "Expected int, got bool"),
         ('"steps": 600, ', "", "missing required field steps"),
         ('"arms": [', '"amrs": [', "unknown field 'amrs'; did you mean 'arms'"),
         ("{", "", r"results\.json is not JSON"),
-        ("", "[] ", r"results\.json"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_by_field(tmp_path, was, becomes, message):
     path, text = tmp_path / "results.json", json.dumps(asdict(made_up_results(made_up_run(psnr=23.6))))
     assert was in text
-    path.write_text(text.replace(was, becomes, 1) if was else becomes)
+    path.write_text(text.replace(was, becomes, 1))
     with pytest.raises(RecordError, match=message) as caught:
         read_results(path)
     assert str(caught.value).startswith(str(path))
