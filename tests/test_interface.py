@@ -33,7 +33,6 @@ def test_the_methods_are_listed():
 
 
 def test_a_config_of_before_the_move_names_what_opens_it():
-    """As ns-eval and others load it."""
     old = "!!python/object:abcd_ns.plugin.config.AbcdTrainerConfig\nmethod_name: abcd\n"
     with pytest.raises(
         yaml.constructor.ConstructorError, match=r"the version that trained it: abcd/settings\.json"

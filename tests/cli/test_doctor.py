@@ -102,20 +102,6 @@ def test_each_ailment_is_found_with_its_cure(found, level, name, said):
     assert said in wanted[0].what + wanted[0].fix
 
 
-def test_where_all_is_well_the_screen_is_short_and_notes_wait_to_be_asked_for(capsys, monkeypatch):
-    found = but(with_tools(), lpips_missing="LPIPS needs weights")
-    monkeypatch.setattr(command, "gather", lambda: found)
-    assert doctor() == 0
-    short = capsys.readouterr().out
-    assert len(short.splitlines()) <= 12
-    assert "gsplat-not-built" not in short
-    assert "2 notes: abcd doctor --verbose" in short
-    doctor(verbose=True)
-    full = capsys.readouterr().out
-    for said in ("gsplat-not-built", "no-lpips", "pycolmap", "13.0"):
-        assert said in full
-
-
 def test_the_report_names_no_home(monkeypatch, capsys):
     home = str(Path.home())
     found = but(broken={"cv2": f"no {home}/lib.so"}, folder=f"{home}/.cache/x")

@@ -106,7 +106,6 @@ def test_large_photos_are_planned_for_as_they_are_trained_on(height):
 
 @pytest.mark.parametrize(("photos", "points"), [(2, 600), (4, 0)])
 def test_plan_and_check_take_what_training_takes(tmp_path, capsys, photos, points):
-    """Few photos, and no points: training warns and begins."""
     write_model(tmp_path / "sparse/0", points=points, names=NAMES[:photos], params=wide)
     write_photos(tmp_path / "images", names=NAMES[:photos])
     assert inspect(parser(tmp_path).config).train == photos - 1

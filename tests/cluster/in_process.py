@@ -1,5 +1,3 @@
-"""Workers in the driver's own process."""
-
 from collections.abc import Callable
 
 from abcd_ns.cluster.assignment import Assignment, Finished, Member, Report, Workers

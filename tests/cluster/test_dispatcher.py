@@ -233,7 +233,6 @@ def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
 
 
 def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
-    """So the light is what the warm-up has made of it."""
     run = make(workers=2, lag=2, density=STILL, coarse_model=40, warmup=0.3, light="affine")
     while not run.trains_elsewhere:
         train(run, photos, steps=1)

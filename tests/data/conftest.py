@@ -1,5 +1,3 @@
-"""A capture to read."""
-
 from pathlib import Path
 
 import pytest

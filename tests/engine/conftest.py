@@ -1,5 +1,3 @@
-"""A small scene to train on, for the tests of training."""
-
 import pytest
 
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views

@@ -1,5 +1,3 @@
-"""What tests of the laboratory share."""
-
 from pathlib import Path
 
 import pytest

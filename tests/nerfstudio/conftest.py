@@ -1,5 +1,3 @@
-"""What most of these tests train on."""
-
 from pathlib import Path
 
 import pytest

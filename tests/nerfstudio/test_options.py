@@ -72,20 +72,9 @@ def help_text() -> str:
     return in_a_fork(say)
 
 
-def test_the_help_has_at_most_forty_flags_most_used_groups_first(help_text):
+def test_the_help_has_at_most_forty_flags(help_text):
     words = set(re.findall(r"--[a-z][\w.-]*", help_text)) - {"--help"}
     assert 30 < len(words) <= 40
-    assert re.findall(r"^\W*(\S* ?options|subcommands)\W*$", help_text, re.MULTILINE) == [
-        "options",
-        "pipeline options",
-        "pipeline.datamanager.dataparser options",
-        "pipeline.training options",
-        "pipeline.training.density options",
-        "pipeline.model options",
-        "machine options",
-        "viewer options",
-        "subcommands",
-    ]
     assert {"colmap", "nerfstudio-data", "blender-data"} <= set(re.findall(r"[\w-]+", help_text))
 
 
@@ -205,13 +194,10 @@ def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, 
 @pytest.mark.parametrize(
     ("word", "says"),
     [
-        ("--pipeline.model.stop-split-at", "training.density.refine-stop"),
         ("--pipeline.model.camera-optimizer.trans-l2-penalty", "training.poses SO3xR3"),
         ("--pipeline.model.grid-shape", "training.light"),
-        ("--mixed-precision", "float32"),
         ("--optimizers.means.scheduler.lr-final", "rates follow the run"),
         ("--optimizers.means.scheduler", "rates follow the run"),
-        ("--viewer.relative-log-filename", "the viewer writes no log"),
         ("--pipeline.training.recipe.layers", "another method"),
         ("--machine.num-machines", "--pipeline.workers"),
     ],

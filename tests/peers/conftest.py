@@ -1,5 +1,3 @@
-"""Peers train on the engine's small scene."""
-
 from tests.engine.conftest import make, photos, start, views
 
 __all__ = ["make", "photos", "start", "views"]

@@ -1,13 +1,7 @@
-"""What is counted on a simulated accelerator."""
-
-import sys
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 
 from torch import Tensor
-
-PACKAGE = str(Path(__file__).resolve().parents[2] / "abcd_ns")
 
 
 @dataclass
@@ -28,8 +22,6 @@ class Counts:
     waits: Counter[str] = field(default_factory=Counter)
     """Points where the host waits for all that it has launched, by operation. Copies from and to pageable
     memory are among them, unless they go to the device and are called with `non_blocking`."""
-    places: Counter[str] = field(default_factory=Counter)
-    """The same by the package's line that waits."""
 
     @property
     def waited(self) -> int:
@@ -51,7 +43,6 @@ class Counts:
 
     def wait(self, why: str) -> None:
         self.waits[why] += 1
-        self.places[_place()] += 1
 
     def move(self, tensor: Tensor, *, to_device: bool, blocks: bool = True) -> None:
         way = "to_device" if to_device else "to_host"
@@ -59,13 +50,3 @@ class Counts:
         setattr(self, f"bytes_{way}", getattr(self, f"bytes_{way}") + tensor.numel() * tensor.element_size())
         if blocks:
             self.wait(f"copy {way}".replace("_", " "))
-
-
-def _place() -> str:
-    """The innermost line of the package that is being run."""
-    frame = sys._getframe(2)
-    while frame is not None:
-        if frame.f_code.co_filename.startswith(PACKAGE):
-            return f"{frame.f_code.co_filename[len(PACKAGE) + 1 :]}:{frame.f_lineno}"
-        frame = frame.f_back
-    return "elsewhere"

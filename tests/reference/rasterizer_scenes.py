@@ -1,5 +1,3 @@
-"""Small scenes and helpers that the rasterizer tests share."""
-
 from collections.abc import Callable
 
 import torch

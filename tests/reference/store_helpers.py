@@ -1,5 +1,3 @@
-"""Blocks, comparisons and faults for the tests of the parameter store."""
-
 import errno
 from pathlib import Path
 

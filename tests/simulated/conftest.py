@@ -1,5 +1,3 @@
-"""What tests on the simulated device share."""
-
 import pytest
 
 from abcd_ns.engine.render import TorchRasterizer

@@ -94,7 +94,6 @@ def test_poses_are_refined_by_pictures_of_several_nodes(on_device, views, photos
 
 
 def test_both_rasterizers_train_alike(on_device, make, photos):
-    """On the device with gsplat, on the device with torch, and on the CPU: the same to rounding."""
     options = {"blocks": 2, "steps": 3, "density": STILL, "ownership": "means"}
     scenes = []
     for coordinator in (on_device("g", **options), on_device("t", "torch", **options), make(**options)):
@@ -116,7 +115,6 @@ def test_a_warm_up_is_trained_and_blocks_that_outgrow_their_limit_are_split(on_d
 
 
 def test_a_run_is_saved_and_gone_on_with(make, on_device, photos):
-    """On the CPU, on the device, and on the CPU again."""
     options = {"steps": 11, "density": GROWING, "blocks": 3}
     first = make(**options)
     train(first, photos, steps=2)

@@ -15,7 +15,6 @@ def kept() -> Kept:
 
 
 def test_what_has_no_room_on_the_device_goes_to_ram_and_is_copied_once_when_read(counts):
-    """Room for two on the device and one in RAM; four are put."""
     store = LayerStore(DEVICE, 2 * SIZE, ram_bytes=SIZE)
     layers = [kept() for _ in range(4)]
     before = counts.copy()

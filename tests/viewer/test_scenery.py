@@ -1,5 +1,3 @@
-"""Boxes and cameras in the viewer's scene."""
-
 import itertools
 
 import pytest

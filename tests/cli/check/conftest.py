@@ -1,5 +1,3 @@
-"""A sound scene, and what `abcd check` reads of it."""
-
 import shutil
 from pathlib import Path
 

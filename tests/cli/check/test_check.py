@@ -98,7 +98,6 @@ def test_damage_in_the_middle_of_a_photo_is_an_error(scene, capsys):
 
 
 def test_names_that_no_terminal_takes_are_escaped(scene, capsys):
-    """A byte that is no UTF-8, and a newline."""
     written, path = b"right/0000.png", scene / "sparse/0/images.bin"
     odd = b"right/\xff\n00.png"
     path.write_bytes(path.read_bytes().replace(written, odd))

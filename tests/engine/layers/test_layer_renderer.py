@@ -11,11 +11,10 @@ from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_grid, build_kd
-from abcd_ns.engine.space.tree import BlockTree, front_to_back
+from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer, View
-from tests.reference.rasterizer_scenes import as_leaves, drawn, probe, relative_error
-from tests.reference.scenes import cell_windows, random_gaussians, ring_of_views
+from abcd_ns.engine.types import Gaussians, Layer, View
+from tests.reference.scenes import random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
 PRIMITIVES = ["3dgs", "2dgs"]
@@ -89,30 +88,6 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(
     assert (len(renderer.nodes()) == 1) == (pass_gaussians >= 100)
     for view in views:
         assert difference(renderer.picture(view, SETTINGS), merged(gaussians, view, draw)) < tolerance
-
-
-@pytest.mark.parametrize("primitive", PRIMITIVES)
-def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(primitive):
-    gaussians, (view, *_) = translucent(60, 0.12), views_in_and_out(torch.float64)
-    tree, draw = build_kd(gaussians.means, 5), DRAWS[primitive, 16]
-    weights = probe(view.height, view.width)[..., :4]
-
-    def gradients_of(layer_of) -> dict[str, torch.Tensor]:
-        leaves = as_leaves(gaussians)
-        layer = layer_of(leaves)
-        picture = torch.cat((layer.color, layer.transmittance[..., None]), dim=-1)
-        (picture * weights).sum().backward()
-        return {name: value.grad for name, value in leaves.items()}
-
-    def folded(leaves: Gaussians) -> Layer:
-        windows = cell_windows(tree, view, draw.window_grid(view.full), [tree.node_of(b) for b in range(5)])
-        parts = {b: drawn(draw, leaves, view, sh_degree=1, z_window=w) for b, w in enumerate(windows)}
-        return fold([parts[block].layer for block in front_to_back(tree, view.center)])
-
-    found = gradients_of(folded)
-    expected = gradients_of(lambda leaves: draw(leaves, view, sh_degree=1).layer)
-    for name in PARAM_NAMES:
-        assert relative_error(found[name], expected[name]) < 1e-10, name
 
 
 def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():

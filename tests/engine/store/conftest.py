@@ -1,5 +1,3 @@
-"""A store with something in it."""
-
 import pytest
 
 from abcd_ns.engine.store import ParameterStore

@@ -13,7 +13,7 @@ from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, stored_blocks
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference import scenes
-from tests.reference.scenes import STILL, assert_resumes, listen, whole_scene
+from tests.reference.scenes import STILL, listen, whole_scene
 
 GROWING = replace(scenes.GROWING, min_contribution=0.0)
 LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
@@ -96,11 +96,6 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
         train_step(coordinator, photos)
     assert len(whole_scene(coordinator)) == coordinator.count() == 120
     assert torch.equal(scene.everything("cpu").means, whole_scene(coordinator).means)
-
-
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
-    """Within the warm-up, at its end, and after it."""
-    assert_resumes(make, photos, 4, 10, 13, blocks=4, steps=24, coarse_model=30, warmup=0.4)
 
 
 @pytest.mark.parametrize("most", [0, 125, 400])

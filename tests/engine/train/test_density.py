@@ -96,7 +96,6 @@ def test_without_room_nothing_is_added_but_the_transparent_go_and_the_large_stay
 
 
 def test_clocks_of_older_versions_are_read():
-    """They counted resets, too."""
     meta = {"clocks": {**vars(Clocks(steps=2, visits=1)), "resets": 3}}
     assert BlockState.clocks_of(meta) == Clocks(steps=2, visits=1)
 

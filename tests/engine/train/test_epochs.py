@@ -100,7 +100,7 @@ def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):
 def test_a_queue_of_before_visits_knew_their_batch_is_read():
     state = RunState(queue=[VisitPlan(3, 10, 2)]).to_json()
     assert RunState.from_json(state).queue == [VisitPlan(3, 10, 2)]
-    state["queue"] = [[3, 10]]
+    state |= {"queue": [[3, 10]], "warm": 0.35}
     assert RunState.from_json(state).queue == [VisitPlan(3, 10)]
 
 

@@ -161,7 +161,6 @@ def test_without_a_price_everything_stays(make, photos):
 
 
 def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
-    """Those of a step are the weights of the block's Gaussians in pictures of the whole scene."""
     coordinator = make(blocks=2, density=replace(STILL, min_contribution=1e-9), batch=1)
     batch, before = coordinator.next_batch(), whole_scene(coordinator)
     block = coordinator.run.active.geometry.block

@@ -114,7 +114,6 @@ def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
 
 
 def test_a_scene_that_cannot_be_read_is_refused_before_the_first_run(plan, worker, capsys):
-    """It is a folder, but holds no model."""
     words = ["compare", "--data", plan.settings.data, "--out", str(plan.out), "--steps", "10"]
     assert cli.main(words) == 2
     assert "holds no model" in " ".join(capsys.readouterr().err.split())
