@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -63,6 +64,17 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 3: seen by 1 view only",
         "  3 oversized Gaussians shrunk",
     ]
+
+
+def test_the_end_names_the_degree_of_harmonics_where_not_all_came(coordinator, capsys):
+    config = coordinator.config
+    coordinator.config = replace(config, sh_degree=3, limits=replace(config.limits, late_harmonics=2))
+    coordinator.state.health, coordinator.state.sh_degree = {0: BlockHealth(visits=2)}, 1
+    ProgressReport(coordinator).close()
+    assert "  harmonics up to degree 1 of 3: others had no room, or no time" in capsys.readouterr().out
+    coordinator.state.sh_degree = 3
+    ProgressReport(coordinator).close()
+    assert "harmonics" not in capsys.readouterr().out
 
 
 def test_the_end_tells_held_out_psnr_where_it_was_measured_after_the_last_step(coordinator, capsys):

@@ -1,9 +1,11 @@
 """Chart, table and pictures, from made-up runs."""
 
 import dataclasses
+from io import StringIO
 from pathlib import Path
 
 from PIL import Image
+from rich.console import Console
 
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import shown
@@ -11,7 +13,7 @@ from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
-from abcd_ns.lab.results.tables import notes, rows, write_table
+from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
 from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
 
 # The charts
@@ -112,6 +114,23 @@ def test_a_method_with_several_arms_has_its_best_and_worst_and_the_fewest_gaussi
     ):
         assert part in finding
     assert made_up("comparison", arms[0]).findings == ()
+
+
+def test_terminal_shows_whole_numbers_however_narrow_it_is():
+    results = made_up_results(*(made_up_run(m, s) for m in METHODS for s in (0, 1)), seeds=(0, 1))
+    stream = StringIO()
+    console = Console(file=stream, width=60)
+    print_rows(rows(results), notes(results), console)
+    assert "…" not in stream.getvalue()
+    assert all(method in stream.getvalue() for method in METHODS)
+    assert console.width == 60
+
+
+def test_runs_of_several_versions_are_told():
+    old = made_up_run("abcd-monolithic")
+    old = dataclasses.replace(old, versions=dataclasses.replace(old.versions, commit="0123456789"))
+    assert any("several versions" in line for line in notes(made_up_results(made_up_run(), old)))
+    assert not any("several versions" in line for line in notes(made_up_results(made_up_run())))
 
 
 # Pictures
