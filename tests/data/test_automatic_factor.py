@@ -32,15 +32,14 @@ def test_photos_are_reduced_to_1600_px_by_the_largest_of_them(long_scene, capsys
     assert "--pipeline.datamanager.dataparser.downscale-factor 1 keeps" in said
 
 
-@pytest.mark.parametrize(("factor", "expected"), [(1, {3300, 900}), (3, {1100, 300})])
-def test_a_factor_that_is_given_is_taken_and_nothing_is_said(long_scene, capsys, factor, expected):
-    assert widths(long_scene, downscale_factor=factor) == expected
-    assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(("side", "width"), [(320, 3300 // 11), (4000, 3300)])
-def test_a_longest_side_that_is_given_is_kept_to_by_a_whole_number(long_scene, capsys, side, width):
-    assert max(widths(long_scene, max_side=side)) == width
+@pytest.mark.parametrize(
+    ("option", "value", "factor"),
+    [("downscale_factor", 1, 1), ("downscale_factor", 3, 3), ("max_side", 320, 11), ("max_side", 4000, 1)],
+)
+def test_what_is_given_is_kept_to_by_a_whole_number_and_nothing_is_said(
+    long_scene, capsys, option, value, factor
+):
+    assert widths(long_scene, **{option: value}) == {3300 // factor, 900 // factor}
     assert capsys.readouterr().out == ""
 
 

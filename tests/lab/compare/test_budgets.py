@@ -62,13 +62,14 @@ def test_joint_training_has_as_many_gaussians_as_fit_and_blocks_choose_for_thems
     assert blocks.workers == 1  # one device
 
 
-@pytest.mark.parametrize("other", [{"blocks": (4,)}, {"vary": ("training.warmup=0",)}])
-def test_what_contradicts_budgets_is_refused_by_name(options, other):
-    with pytest.raises(UserError, match=f"--{min(other)} does not go with --budgets"):
-        make_plan(Options(**{**vars(options), **other}))
-
-
-@pytest.mark.parametrize("share", ["0", "-1/2", "2", "half", "1/0"])
-def test_a_budget_that_is_no_share_is_refused(options, share):
-    with pytest.raises(UserError, match=r"--budgets .*give shares above 0 and up to 1"):
-        make_plan(Options(**{**vars(options), "budgets": (share,)}))
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("blocks", (4,), "--blocks does not go with --budgets"),
+        ("vary", ("training.warmup=0",), "--vary does not go with --budgets"),
+        *(("budgets", (n,), "give shares above 0 and up to 1") for n in ("0", "-1/2", "2", "half", "1/0")),
+    ],
+)
+def test_what_contradicts_budgets_or_is_none_is_refused(options, name, value, says):
+    with pytest.raises(UserError, match=says):
+        make_plan(Options(**{**vars(options), name: value}))
