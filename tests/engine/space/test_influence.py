@@ -12,6 +12,7 @@ from abcd_ns.engine.space.influence import (
     coarser,
     influence,
     overlaps,
+    share_shown,
     visible_blocks,
     weights,
     worth_training,
@@ -57,6 +58,17 @@ def test_large_views_are_looked_at_in_small_pictures():
     assert set(sizes) == {(80, 60)}
     full = weights(gaussians, TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)])
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
+
+
+def test_what_stands_in_front_takes_its_share(rasterizer):
+    gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
+    shot = Shot(view, view.full)
+    (bare,) = weights(gaussians, rasterizer, [shot])
+    whole = share_shown(gaussians, rasterizer, shot, None)
+    half = share_shown(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
+    assert whole == pytest.approx(float(bare.sum()) / view.full.pixels, abs=2e-6)
+    assert half == pytest.approx(whole / 2, abs=2e-6)
+    assert whole > 1e-3
 
 
 def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer):
