@@ -10,7 +10,7 @@ BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
 
 
 def test_it_fetches_no_weights(monkeypatch):
-    """That it trains, grows and draws on a CPU is seen in compare/test_real.py."""
+    """That it trains and draws on a CPU is seen in compare/test_real.py."""
 
     def fetch(*_args, **_options):
         raise AssertionError("asked the network")
