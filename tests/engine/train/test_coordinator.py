@@ -10,8 +10,9 @@ from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan
 from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
-from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING
-from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, WHOLE
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
@@ -203,6 +204,20 @@ def test_a_scene_that_no_view_sees_is_an_error_that_says_so(make, photos, start)
     start.means[:] += 1000.0
     with pytest.raises(RuntimeError, match="no training view sees any Gaussian"):
         train_step(make(blocks=2), photos)
+
+
+def test_the_state_of_a_run_survives_json(make, photos):
+    coordinator = make(blocks=4, steps=50)
+    train(coordinator, photos, steps=7)
+    state = coordinator.state
+    state.health |= {WHOLE: BlockHealth(gradients=3), 4: BlockHealth(visits=2, hidden=True)}
+    state.influence = {0: {2: 0.5}}
+    state.active.looked_at = (2,)
+    again = RunState.from_json({**state.to_json(), "warm": 0.35})  # as before 2026-11-24
+    assert again.to_json() == state.to_json()
+    assert (again.health, again.influence, again.queue) == (state.health, state.influence, state.queue)
+    assert again.active.looked_at == (2,)
+    assert again.active.geometry.crops == state.active.geometry.crops
 
 
 def off_from_merged(coordinator, batch, pictures) -> list[torch.Tensor]:
