@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import Repaired
 from abcd_ns.engine.render import Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen, veils
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
 from tests.reference.scenes import activated, listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
@@ -122,6 +123,17 @@ def before_a_camera(view: View, count: int) -> Gaussians:
     found = random_gaussians(count, seed=3, size=0.05)
     spot = view.center + 0.05 * view.viewmat[2, :3]
     return replace(found, means=spot.expand(count, 3).clone(), opacities=torch.full((count, 1), 2.0))
+
+
+def test_what_veils_a_view_is_what_its_near_plane_hides(start, views):
+    views = [replace(view, near=0.2) for view in views]
+    scene, rasterizer = Gaussians.cat([start, before_a_camera(views[1], 2)]), TorchRasterizer()
+    whole = Shot(replace(views[1], near=NEAR_PLANE), views[1].full)
+    (expected,) = weights(scene, rasterizer, [whole])
+    found = veils(scene, views, rasterizer, antialiased=False)
+    assert float(found[-2:].sum()) > 0.5 * whole.crop.pixels
+    torch.testing.assert_close(found[-2:], expected[-2:])
+    assert bool((found[:-2] == 0).all())
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
