@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pytest
 from rich.console import Console
 
-from abcd_ns.lab.results.records import encode, read_json, write_json
+from abcd_ns.lab.results.records import read_json, write_json
 from abcd_ns.lab.results.results import Arm
 from benchmarks import gpu
 from benchmarks.gpu import Args, main, show

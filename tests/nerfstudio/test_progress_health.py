@@ -10,7 +10,7 @@ from rich.console import Console
 from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, VisitBegan
 from abcd_ns.engine.train.run_state import BlockHealth, Stopwatch
 from abcd_ns.nerfstudio.run import progress
-from abcd_ns.nerfstudio.run.progress import ProgressReport, summary
+from abcd_ns.nerfstudio.run.progress import ProgressReport
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 

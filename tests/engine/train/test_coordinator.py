@@ -11,8 +11,7 @@ from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, WHOLE
-from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import Budget, RunState
+from abcd_ns.engine.train.run_state import BlockHealth, Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain

@@ -11,7 +11,6 @@ from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import OVERSIZED_ANGLE, unsound
 from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_room, parameter_bytes
-from abcd_ns.engine.train.run_state import BlockHealth, standing
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES

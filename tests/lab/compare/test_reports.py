@@ -11,7 +11,7 @@ from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import shown
 from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Plan
-from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
 from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
 from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
