@@ -176,10 +176,14 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
             known = ((row, rows.get(path, -1)) for row, path in enumerate(dataset.image_filenames))
             place_cameras(dataset.cameras, {row: poses[own] for row, own in known if own in poses})
 
+    def photo(self, row: int, crop: Crop) -> torch.Tensor:
+        """Pixels of a training photo on the device: float32 [h, w, 3 or 4] in 0..1."""
+        return self._pixels("image", row, crop).float() / 255
+
     def target(self, sample: Sample) -> Target:
-        """A sample's photo, float32 [h, w, 3] in 0..1, composited on its background, and its mask."""
+        """A sample's photo, composited on its background, and its mask."""
         shot = sample.view.index, sample.source
-        photo = sample.reduced(self._pixels("image", *shot).float() / 255)
+        photo = sample.reduced(self.photo(*shot))
         if photo.shape[-1] == 4:  # as splatfacto's model composites
             photo = photo[..., 3:] * photo[..., :3] + (1 - photo[..., 3:]) * sample.background
         return photo, sample.reduced_mask(self._pixels("mask", *shot))
