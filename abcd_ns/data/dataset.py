@@ -45,8 +45,14 @@ class AbcdDataset(InputDataset):
         """uint8 [H, W, 3 or 4], shared with later callers: do not write to it."""
         return self.photos.image(image_idx).numpy()
 
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
+        """On black where it is transparent: ns-render dataset shows four channels in false colours."""
+        image = super().get_image_float32(image_idx)
+        return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
+
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """`image_idx`, `image` [H, W, 3 or 4] of the type asked for and, if any, `mask` bool [H, W, 1]."""
+        """`image_idx`, `image` of the type asked for, [H, W, 3] or, as uint8, also [H, W, 4], and, if any,
+        `mask` bool [H, W, 1]."""
         read = {"uint8": self.get_image_uint8, "float32": self.get_image_float32}[image_type]
         mask = self.photos.mask(image_idx)
         data = {"image_idx": image_idx, "image": read(image_idx)}

@@ -39,6 +39,14 @@ def write_blender(folder: Path, splits: tuple[str, ...] = ("train", "val", "test
 # Photos and masks elsewhere
 
 
+def test_transparent_photos_are_colours_on_black_to_ns_render_and_the_viewer(tmp_path):
+    """ns-render dataset draws pictures of more than three channels by their principal components."""
+    dataset = AbcdDataset(parser(write_blender(tmp_path)).get_dataparser_outputs())
+    stored, shown = dataset.get_data(0, "uint8")["image"].float() / 255, dataset[0]["image"]
+    assert stored.shape == (24, 32, 4)
+    assert torch.equal(shown, stored[..., :3] * stored[..., 3:])
+
+
 @pytest.mark.parametrize("called", ["{stem}.png", "{name}.png", "{name}"])
 def test_masks_of_a_colmap_model_are_found_by_name(scene, called):
     for i, name in enumerate(NAMES):
