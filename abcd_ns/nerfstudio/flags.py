@@ -20,6 +20,7 @@ from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
 
 METHODS = "abcd"  # start of the names of all our methods
+LOAD_CONFIG = ("--load-config", "--load_config")
 UNUSED_OF_VIEWER = {
     "num_rays_per_chunk": "it is about rays, and Gaussians are not drawn by rays",
     "relative_log_filename": "the viewer writes no log",
@@ -57,6 +58,11 @@ def check_config(words: Sequence[str]) -> None:
         refused = f"{path} is damaged"
     else:
         if root is not None and root.tag.startswith("tag:yaml.org,2002:python/object"):
+            flags = [word for word in words[2:] if word.startswith("--")]
+            beside = [flag for flag in flags if not flag.startswith(LOAD_CONFIG)]
+            if beside and trains_ours(words):
+                why = "takes all options from its file, and none beside it"
+                raise UserError(f"--load-config {why}: write {beside[0]} into {path}, or leave it out.")
             return
         refused = f"{path} describes no run"
     raise UserError(f"{refused}: give --load-config outputs/SCENE/METHOD/TIME/config.yml.")

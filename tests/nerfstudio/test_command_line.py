@@ -89,6 +89,15 @@ def test_a_config_that_is_none_is_one_line_before_it_is_read(tool, content, why,
     check_config(["ns-eval", "--load-config", "fox/splatfacto/now/config.yml"])
 
 
+def test_options_beside_a_config_to_train_by_are_refused_for_nerfstudio_drops_them(tmp_path):
+    path = tmp_path / "config.yml"
+    path.write_text("!!python/object:abcd_ns.nerfstudio.trainer.AbcdTrainerConfig {}")
+    given = ["ns-train", "abcd", f"--load-config={path}"]
+    check_config(given)
+    with pytest.raises(UserError, match=r"write --load-dir into .*, or leave it out"):
+        check_config([*given, "--load-dir", "outputs/fox/abcd/now"])
+
+
 REFUSED = {
     "ns-export poisson": "abcd mesh",
     "ns-export tsdf": "abcd mesh",

@@ -38,6 +38,7 @@ def test_handlers_are_put_back():
         ("ns-train abcd --load-dir=older --data wall", "ns-train abcd --load-dir 'my run' --data wall"),
         ("/venv/lib/abcd_ns/lab/runs/worker.py job.json", None),
         ("ns-train abcd-paper --data wall", None),
+        ("ns-train abcd --load_config=mine.yml", None),
     ],
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from abcd_ns.nerfstudio.flags import LOAD_CONFIG
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 FORGOTTEN = ("--load-dir", "--load-step", "--load-checkpoint")
 """Options of a run that the command to resume it does not repeat."""
@@ -81,9 +83,10 @@ def command_to_resume(
     argv: Sequence[str], method: str, folder: Path, changed: Sequence[str] = ()
 ) -> str | None:
     """The same command with --load-dir `folder`, and an option and its value `changed`; None if it is not
-    `ns-train`'s."""
+    `ns-train`'s, or takes no options beside a file's."""
     program, *words = argv
-    if Path(program).name != "ns-train" or words[:1] != [method]:
+    by_file = any(word.startswith(LOAD_CONFIG) for word in words)
+    if by_file or Path(program).name != "ns-train" or words[:1] != [method]:
         return None
     kept, skip = list[str](), False
     for word in words[1:]:
