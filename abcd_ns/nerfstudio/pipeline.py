@@ -141,6 +141,11 @@ class AbcdPipeline(VanillaPipeline):
             earlier = earlier + loss.detach()
             del outputs, losses, loss  # frees memory for the next part
 
+    def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """As VanillaPipeline's; while training, it is no training time."""
+        self._before_evaluation()
+        return super().get_eval_loss_dict(step)
+
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
         self._before_evaluation()

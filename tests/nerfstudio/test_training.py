@@ -20,6 +20,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import PENDING
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
@@ -237,6 +238,22 @@ def test_no_time_counts_while_the_viewer_has_the_run_paused(data, tmp_path):
     trainer = run(configure(data, tmp_path, steps=6), after_step=pause)
     assert trainer.pipeline.coordinator.state.step == 6
     assert trainer.pipeline.coordinator.stopwatch.seconds < time.monotonic() - began - waited
+
+
+def test_no_time_counts_while_a_held_out_photo_is_compared(data, tmp_path, monkeypatch):
+    config, counting = configure(data, tmp_path, steps=4), []
+    config.steps_per_eval_batch, config.steps_per_eval_image = 1, 2
+    shown = AbcdDataManager.next_eval_image
+
+    def watched(manager: AbcdDataManager, step: int):
+        before = manager._coordinator.stopwatch.seconds
+        counting.append(manager._coordinator.stopwatch.seconds > before)
+        return shown(manager, step)
+
+    monkeypatch.setattr(AbcdDataManager, "next_eval_image", watched)
+    run(config)
+    assert len(counting) > 3
+    assert not any(counting)
 
 
 @pytest.mark.parametrize("kind", ["user", "signal"])
