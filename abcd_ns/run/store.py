@@ -8,6 +8,7 @@ from typing import Any
 
 from abcd_ns.engine.render import PrimitiveName
 from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.train.capture.light import Kind as LightKind
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -41,6 +42,7 @@ class MadeFor:
     sh_degree: int
     primitive: PrimitiveName
     antialiased: bool = False
+    light: LightKind = "none"
 
     @staticmethod
     def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
@@ -51,7 +53,7 @@ class MadeFor:
         first_camera = [round(value, 3) for value in views[0].center.tolist()]
         recipe = training.recipe
         how = "jointly" if recipe.exact else "each alone" if recipe.overlap > 0 else "in turn"
-        drawn = training.sh_degree, training.primitive, training.antialiased
+        drawn = training.sh_degree, training.primitive, training.antialiased, training.light
         return MadeFor(digest.hexdigest(), first_camera, how, *drawn)
 
     def check(self, store: ParameterStore) -> None:

@@ -292,9 +292,10 @@ def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
     moved = MadeFor.of([Path("new") / photo.name for photo in photos], views, TrainingConfig())
     fewer = MadeFor.of(photos[:2], views[:2], TrainingConfig())
     turned = MadeFor.of(photos, [*views[1:], views[0]], TrainingConfig())
-    joint, discs, soft = (
-        MadeFor.of(photos, views, TrainingConfig(**option))
-        for option in ({"recipe": Recipe(exact=True)}, {"primitive": "2dgs"}, {"antialiased": True})
+    changed = {"primitive": "2dgs"}, {"antialiased": True}, {"light": "affine"}
+    joint, discs, soft, lit = (
+        MadeFor.of(photos, views, TrainingConfig(**each))
+        for each in ({"recipe": Recipe(exact=True)}, *changed)
     )
     different = {
         f"photos {mine.photos}, not {fewer.photos}": fewer,
@@ -302,6 +303,7 @@ def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
         "blocks are trained in turn, not jointly": joint,
         "primitive 3dgs, not 2dgs": discs,
         "antialiased False, not True": soft,
+        "light none, not affine": lit,
     }
     with ParameterStore.create(tmp_path / "new", mine.header()) as store:
         moved.check(store)
