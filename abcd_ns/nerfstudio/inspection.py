@@ -1,5 +1,6 @@
 """What there is to train on, read and checked before a run begins."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
 from abcd_ns.nerfstudio.model import AbcdModelConfig
+from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.run.store import MadeFor
 
 SOME_MEANS = 1000  # of a file's Gaussians that are looked for among the points
 
@@ -38,6 +41,8 @@ class Inspected:
     """The points, in the run's frame, [n, 3]."""
     to_run: Frame | None = field(default=None, compare=False)
     """From the frame of the photos' poses."""
+    made_for: Callable[[TrainingConfig], MadeFor] | None = field(default=None, compare=False)
+    """What a run on this, with such options, is made for."""
 
     @property
     def pixels(self) -> int:
@@ -66,7 +71,9 @@ def inspect(config: DataParserConfig) -> Inspected:
     train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
     cloud = np.asarray(parts[0].metadata.get("points3D_xyz", np.zeros((0, 3))))
     to_run = Frame.of(parts[0].dataparser_transform, parts[0].dataparser_scale)
-    return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run)
+    photos, cameras = parts[0].image_filenames, parts[0].cameras
+    made_for = lambda training: MadeFor.of(photos, views_of(cameras), training)  # noqa: E731 - rarely asked
+    return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run, made_for)
 
 
 def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found: Inspected) -> int:

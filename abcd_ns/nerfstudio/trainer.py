@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from abcd_ns.data.input_errors import exit_on_user_error, print_error, say
 from abcd_ns.engine.events import Event, LayersDrawn, Pruning, WorkersSeen
 from abcd_ns.engine.gaussians.adam import Adam
-from abcd_ns.engine.store import StoreError, crash_points
+from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, hidden, opened, shown
@@ -140,6 +140,9 @@ class AbcdTrainerConfig(TrainerConfig):
                 )
             found = inspect(pipeline.datamanager.reader())
             say(found.in_words())
+            if start:  # before its config.yml is replaced
+                with ParameterStore.open(start.store, start.pin, read_only=True) as store:
+                    found.made_for(pipeline.training).check(store)
             splats = 0 if start else splats_to_begin_with(model, pipeline.training, found)
             if pipeline.blocks == 0:
                 points = splats or (0 if model.random_init else found.points) or model.num_random

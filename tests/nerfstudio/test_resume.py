@@ -283,7 +283,13 @@ def test_other_options_than_the_stores_are_refused_and_both_are_shown(
 ):
     config = configure(data, tmp_path / "b", load_dir=stopped)
     set_option(config, name, value)
-    assert said in refusal(config, capsys, late="training" in name)
+    assert said in refusal(config, capsys)
+
+
+def test_a_refused_run_leaves_the_config_of_the_one_it_was_to_resume(data, stopped, capsys):
+    config = configure(data, stopped.parents[2], load_dir=stopped)  # the very folder
+    config.pipeline.datamanager.dataparser.downscale_factor = 2
+    assert "it was made for photos" in refusal(config, capsys)
 
 
 def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
