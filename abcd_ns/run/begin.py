@@ -38,7 +38,7 @@ from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from abcd_ns.run import fit
 from abcd_ns.run.fit import COARSE_MODEL, FITTED, RamShares
 from abcd_ns.run.options import RunOptions
-from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
+from abcd_ns.run.store import ASKED, MEMORY, MadeFor, Start, take_over
 
 Say = Callable[[str], None]
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
@@ -114,7 +114,8 @@ def begin_run(
         tree = BlockTree.from_json(store.header["tree"])
         scene = StoredScene(tree, store, RamShares.of(options.ram_budget_gb).blocks)
         fitted = {name: store.header.get(name, 0) for name in (*FITTED, COARSE_MODEL)}
-        if start is not None and options.blocks == 0 and options.device_budget_gb > 0:
+        asked = _memory_asked(options)
+        if start is not None and any(asked) and asked != store.header.get(MEMORY):
             # It resumes with a budget of its own; else it keeps the limits that it began with.
             there, blocks = sum(map(store.counts, range(tree.num_blocks))), tree.num_blocks
             photos = capture.pixels, capture.factor
@@ -180,6 +181,7 @@ def _new_store(
         tree = build_grid(cloud.means, counts=grid_counts(cloud.means, blocks))
     keep = _coarse_model_size(options, capture, len(cloud), tree.num_blocks, fitted)
     header = {"tree": tree.to_json(), **fitted, COARSE_MODEL: keep or 0, ASKED: options.blocks}
+    header[MEMORY] = _memory_asked(options)
     store = ParameterStore.create(folder, {**header, **made_for.header()})
     if training.recipe.overlap > 0:
         content = independent_blocks(tree, cloud)
@@ -188,6 +190,11 @@ def _new_store(
     del cloud  # frees it while blocks are written
     store.commit(content)
     return store
+
+
+def _memory_asked(options: RunOptions) -> list[float]:
+    """What a run's limits follow from; zeros where it keeps to no budget, or to what the machine has."""
+    return [0.0, 0] if options.blocks else [options.device_budget_gb, options.gaussian_bytes]
 
 
 def _coarse_model_size(

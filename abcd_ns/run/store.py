@@ -14,8 +14,9 @@ from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 
 MADE_FOR = "made for"
-ASKED = "blocks asked for"
-"""Entries of a store's header: what can resume it, and `--pipeline.blocks` of the run that began it."""
+ASKED, MEMORY = "blocks asked for", "memory asked for"
+"""Entries of a store's header: what can resume it, and of the run that began it `--pipeline.blocks`, and
+`device-budget-gb` and `gaussian-bytes`."""
 
 
 @dataclass(frozen=True)

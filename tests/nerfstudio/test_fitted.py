@@ -5,6 +5,7 @@ import torch
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
+from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from abcd_ns.run.fit import Fit
 from abcd_ns.units import GIB
 from tests.nerfstudio.crash_training import gaussians
@@ -37,3 +38,20 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     assert max(crop.pixels for crop in crops) <= 600
     found, expected = gaussians(resumed.base_dir), gaussians(straight.base_dir)
     assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_a_run_that_resumes_with_the_budget_it_began_with_keeps_its_limits(data, tmp_path, monkeypatch):
+    """By the Gaussians that have come since, the same budget would give others, or be refused."""
+
+    def begun(name: str, budget: float, stop_after: int, **options) -> AbcdTrainer:
+        config = configure(data, tmp_path / name, blocks=0, steps=STEPS, **options)
+        config.pipeline.device_budget_gb = budget
+        return run(config, stop_after=stop_after)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("abcd_ns.run.fit.find_fit", lambda *_: FIT)
+        folder = begun("stopped", 0.5, 9).base_dir
+    same, other = (begun(f"with {gib}", gib, 11, load_dir=folder) for gib in (0.5, 2.0))
+    limits = [trainer.pipeline.coordinator.config.limits.sole_limit for trainer in (same, other)]
+    assert limits[0] == FIT.sole
+    assert limits[1] != FIT.sole
