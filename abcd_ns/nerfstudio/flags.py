@@ -108,14 +108,16 @@ def check_tool(words: Sequence[str]) -> None:
             raise UserError(f"{path} {why}") from None
 
 
-def check_held_out(words: Sequence[str]) -> None:
-    """Raise a UserError if a command asks for held-out photos; for runs that have none."""
+def check_held_out(words: Sequence[str], held_out: int = 0) -> None:
+    """Raise a UserError if a command asks for more held-out photos than there are, which is none or one."""
     tool, what = Path(words[0]).stem, "".join(words[1:2])
     flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
-    if tool == "ns-eval":
+    if tool == "ns-eval" and not held_out:
         raise UserError("This run's data holds no photos out, so there is nothing to score.")
-    if tool == "ns-render" and flag and _value(words, flag) != "train":
-        raise UserError(f"This run's data holds no photos out: add {flag} train.")
+    too_few = what == "interpolate" or not held_out
+    if tool == "ns-render" and flag and too_few and _value(words, flag) != "train":
+        found = "one photo" if held_out else "no photos"
+        raise UserError(f"This run's data holds {found} out: add {flag} train.")
 
 
 def check_box(words: Sequence[str], means: Float[Tensor, "n 3"]) -> None:

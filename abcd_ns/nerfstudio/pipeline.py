@@ -77,8 +77,8 @@ class AbcdPipeline(VanillaPipeline):
             if (opens := opened(sys.argv)) is not None:
                 config.datamanager.data = where_data_is(config.datamanager.data, opens)
             super().__init__(config, *args, **kwargs)
-            if not len(self.datamanager.eval_dataset):
-                check_held_out(sys.argv)
+            if (held_out := len(self.datamanager.eval_dataset)) < 2:  # as many as a path begins and ends at
+                check_held_out(sys.argv, held_out)
         self.coordinator: Trainer | None = None
         """Drives the training once it has begun."""
         self._drawn: list[Rendered] = []

@@ -138,6 +138,13 @@ def test_held_out_photos_are_missed_where_they_are_asked_for(line, remedy):
         check_held_out(line.split())
 
 
+def test_a_single_held_out_photo_is_too_few_for_a_path_alone():
+    for line in ("ns-eval", "ns-render dataset", "ns-render interpolate --pose-source train"):
+        check_held_out(line.split(), 1)
+    with pytest.raises(UserError, match="holds one photo out: add --pose-source train"):
+        check_held_out(["ns-render", "interpolate"], 1)
+
+
 def test_data_is_found_by_the_folder_that_the_run_lies_in(tmp_path):
     data, config = tmp_path / "project/photos", tmp_path / "project/outputs/run/config.yml"
     data.mkdir(parents=True)
