@@ -118,7 +118,7 @@ HIDDEN = tuple(
 )
 """Options of splatfacto's model that have no effect, or are set under other names."""
 _BUDGETS = ("device_budget_gb", "gaussian_bytes", "ram_budget_gb", "datamanager.photo_cache_gb")
-NOT_BELOW_0 = ("blocks", "near_plane", *_BUDGETS)
+NOT_BELOW_0 = ("blocks", "near_plane", "model.num_random", "model.random_scale", *_BUDGETS)
 
 
 def check_options(config: TrainerConfig) -> None:
@@ -129,6 +129,8 @@ def check_options(config: TrainerConfig) -> None:
         if not 0 <= value < math.inf:
             flag = name.replace("_", "-")
             raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")
+    if config.max_num_iterations < 1:
+        raise UserError(f"--max-num-iterations must be 1 or more, not {config.max_num_iterations}.")
     if pipeline.blocks > MAX_BLOCKS:
         raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {pipeline.blocks}.")
     if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:

@@ -136,6 +136,7 @@ def test_the_same_options_of_splatfacto_are_taken_and_the_recipe_is_the_methods(
 
 
 BELOW_0 = ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb")
+OF_TRAINING = ("batch", "point_pixels", "commit_seconds", "density.min_contribution", "density.refine_every")
 
 
 @pytest.mark.parametrize(
@@ -156,7 +157,13 @@ BELOW_0 = ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "dataman
         ("pipeline.model.camera_optimizer.mode", "SO3xR3", "training.poses"),
         ("pipeline.cluster", "10.0.0.1:6379", "needs a number of workers"),
         ("pipeline.blocks", MAX_BLOCKS + 1, "--pipeline.blocks must be 65536 or less, not 65537"),
-        ("pipeline.training.batch", -1, "batch must be 0 or more"),
+        *(
+            (f"pipeline.training.{way}", -1, f"{way.replace('_', '-')} must be 0 or more")
+            for way in OF_TRAINING
+        ),
+        ("pipeline.training.ssim_lambda", 1.5, "ssim-lambda must be from 0 to 1"),
+        ("pipeline.model.num_random", -1, "num-random must be 0 or more"),
+        ("max_num_iterations", 0, "--max-num-iterations must be 1 or more"),
         ("pipeline.training.recipe", Recipe(overlap=0.2), "recipe.overlap is 0.2"),
         *(("pipeline.training.warmup", share, "--pipeline.training.warmup") for share in (1.0, math.nan)),
         *(("pipeline.training.sh_degree", n, "training.sh-degree must be from 0 to 3") for n in (-1, 4)),

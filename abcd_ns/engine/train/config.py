@@ -12,6 +12,9 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 
+_OF_DENSITY = ("max-gaussians", "min-contribution", "split-pixels", "refine-every")
+NOT_BELOW_0 = ("batch", "point-pixels", "commit-seconds", *(f"density.{name}" for name in _OF_DENSITY))
+
 
 @dataclass
 class TrainingConfig:
@@ -77,8 +80,8 @@ class TrainingConfig:
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
-            ("batch", self.batch >= 0, "0 or more"),
-            ("density.max-gaussians", self.density.max_gaussians >= 0, "0 or more"),
+            ("ssim-lambda", 0 <= self.ssim_lambda <= 1, "from 0 to 1"),
+            *((name, attrgetter(name.replace("-", "_"))(self) >= 0, "0 or more") for name in NOT_BELOW_0),
         ):
             if not fits:
                 value = attrgetter(name.replace("-", "_"))(self)
