@@ -83,7 +83,7 @@ def test_transparent_photos_lie_on_the_readers_colour(tmp_path):
     )
     assert torch.allclose(ours[0]["image"], theirs[0]["image"], atol=0.5 / 255 + 1e-6)
     kept = BlenderDataParserConfig(data=data, alpha_color=None).setup().get_dataparser_outputs("train")
-    assert AbcdDataset(kept)[0]["image"].shape == (24, 32, 4)
+    assert AbcdDataset(kept).get_data(0, "uint8")["image"].shape == (24, 32, 4)
 
 
 def test_masks_come_along(photo):

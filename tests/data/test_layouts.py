@@ -85,7 +85,7 @@ def test_blender_scenes_come_in_their_splits(tmp_path, splits, held_out):
         f"train/r_{k}.png" for k in range(3)
     ]
     assert {path.parent.name for path in test.image_filenames} == {held_out}
-    assert AbcdDataset(train)[0]["image"].shape == (24, 32, 4)
+    assert AbcdDataset(train).get_data(0, "uint8")["image"].shape == (24, 32, 4)
     theirs = BlenderDataParserConfig(data=data).setup().get_dataparser_outputs("train")
     assert torch.allclose(train.cameras.fx, theirs.cameras.fx.float())
     back = train.transform_poses_to_original_space(train.cameras.camera_to_worlds, "opengl")
