@@ -37,7 +37,7 @@ COMMANDS = (
     Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
     Command("poses", "abcd_ns.cli.poses:poses", "find the camera poses of photos, by pycolmap"),
     Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
-    Command("plan", "abcd_ns.cli.plan:plan", "predict blocks, memory and time of a run"),
+    Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
     Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", passes_on=True),
     Command("report", "abcd_ns.cli.report.command:report", "write an HTML page about a run"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
@@ -101,6 +101,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except UserError as error:
         message = str(error)
     except ImportError as error:
+        if (error.name or "").startswith("abcd_ns"):
+            raise
         message = missing(error)
     except OSError as error:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)

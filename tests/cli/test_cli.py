@@ -20,6 +20,7 @@ RAISED = {
     "missing": ModuleNotFoundError("No module named 'no_such_package'"),
     "ctrl-c": KeyboardInterrupt(),
     "bug": ValueError("a bug"),
+    "import of a name that is gone": ImportError("cannot import name", name="abcd_ns.cli"),
     "bug of the system's": OSError(errno.EBADF, "Bad file descriptor"),
 }
 
@@ -106,7 +107,7 @@ def test_what_a_user_can_mend_is_one_line_without_traceback(greet, capsys, name,
     assert capsys.readouterr() == ("", said)
 
 
-@pytest.mark.parametrize("name", ["bug", "bug of the system's"])
+@pytest.mark.parametrize("name", ["bug", "import of a name that is gone", "bug of the system's"])
 def test_a_bug_keeps_its_traceback(greet, name):
     with pytest.raises(type(RAISED[name])):
         greet("--name", name)

@@ -12,8 +12,9 @@ import torch
 from rich.console import Console
 
 from abcd_ns.cli.check.command import check
-from abcd_ns.cli.forecast import LOST, Capture, Forecast, forecast, print_forecast
-from abcd_ns.cli.plan import Wanted, plan
+from abcd_ns.cli.plan.command import plan
+from abcd_ns.cli.plan.forecast import LOST, Capture, Forecast, forecast, print_forecast
+from abcd_ns.cli.plan.wanted import Wanted
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect

@@ -155,9 +155,11 @@ class Planner(Visits):
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
         recipe, state, blocks = self._config.recipe, self._run.state, self._scene.tree.num_blocks
         if not state.views:
+            views = {}
             for block in range(blocks):  # a visit looks again
                 known = self._known_to_show(block, state.influence.get(block, ()))
-                state.views[block] = len(known) or self._views_seeing(block)
+                views[block] = len(known) or self._views_seeing(block)
+            state.views = views  # all or none, as looking may fail
         else:
             state.epoch += 1
             for block, seen in state.views.items():

@@ -1,33 +1,16 @@
 """`abcd plan`: what a run on these photos needs, and what would not fit."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from abcd_ns.arguments import Number, check_ranges
+from abcd_ns.arguments import check_ranges
+from abcd_ns.cli.plan.wanted import Wanted
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a run is to be like."""
-
-    blocks: Number = 0
-    """Number of blocks. 0 takes as few as the device's budget permits."""
-    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
-    """Memory of the device that training may take.
-    0 takes 90% of a GPU's free memory, or a quarter of the RAM on a CPU."""
-    max_gaussians: Number = 0
-    """Limit on Gaussians in the scene. 0 sets none; the forecast is five for each point."""
-    steps: Number = 30_000
-    """Steps of the run."""
-    workers: Number = 1
-    """Blocks trained at once, each by a process on its own GPU or on a part of the cores."""
 
 
 @tyro.conf.configure(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
@@ -62,7 +45,7 @@ def plan(
     check_ranges({**given, "downscale": downscale})
     if not data.exists():
         raise UserError(f"--data {data} does not exist.")
-    from abcd_ns.cli.forecast import forecast, print_forecast, read  # loads nerfstudio, in seconds
+    from abcd_ns.cli.plan.forecast import forecast, print_forecast, read  # loads nerfstudio, in seconds
 
     console = Console()
     found = forecast(read(data, downscale, console), wanted, console)
