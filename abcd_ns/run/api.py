@@ -78,10 +78,7 @@ def train(
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     training, (places, colors) = options.training, points
     _check(views, photos, steps, options, device, folder)
-    if not 0 < len(places) == len(colors):
-        raise UserError(f"There are {len(places)} points and {len(colors)} colours: give one for each.")
-    if not places.isfinite().all(dim=1).any():
-        raise UserError("No point is finite: give points in the world space of the views.")
+    _check_points(places, colors)
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
 
@@ -131,6 +128,13 @@ def render(
     options = {"sh_degree": gaussians.sh_degree, "antialiased": scene.antialiased}
     raster = rasterizer_on(device, scene.primitive)(gaussians, placed, **options)
     return composite(raster.layer, torch.tensor(background, device=device)).clamp(0, 1)
+
+
+def _check_points(places: Tensor, colors: Tensor) -> None:
+    if not 0 < len(places) == len(colors):
+        raise UserError(f"There are {len(places)} points and {len(colors)} colours: give one for each.")
+    if not places.isfinite().all(dim=1).any():
+        raise UserError("No point is finite: give points in the world space of the views.")
 
 
 def _check(
