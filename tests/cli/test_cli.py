@@ -126,7 +126,7 @@ def wrong_words() -> list[tuple[str, str]]:
         ("export run --out absent/scene.ply", "absent does not exist; make it first"),
         ("mesh run --data photos --out scene.obj", "--out scene.obj must end in .ply"),
         ("mesh absent --data photos --out scene.ply", "absent is no run"),
-        ("plan --data absent", "--data absent does not exist"),
+        ("plan --data absent", "--data absent does not exist; give a folder with a COLMAP model"),
         ("poses absent", "absent/images does not exist"),
         ("train absent.toml", "absent.toml does not exist"),
         ("train run", "run cannot be read as TOML"),

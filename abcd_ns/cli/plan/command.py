@@ -9,6 +9,7 @@ from rich.console import Console
 
 from abcd_ns.arguments import check_ranges
 from abcd_ns.cli.plan.wanted import Wanted
+from abcd_ns.data.prepare import SceneOptions, read_scene
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
 
@@ -44,7 +45,7 @@ def plan(
     given = {name: getattr(wanted, name) for name in ("max_gaussians", "steps", "workers")}
     check_ranges({**given, "downscale": downscale})
     if not data.exists():
-        raise UserError(f"--data {data} does not exist.")
+        read_scene(SceneOptions(data=data))  # refuses it at once, with advice
     from abcd_ns.cli.plan.forecast import forecast, print_forecast, read  # loads nerfstudio, in seconds
 
     console = Console()
