@@ -1,12 +1,11 @@
 """What there is to train on, read and checked before a run begins."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -41,13 +40,17 @@ class Inspected:
     """The points, in the run's frame, [n, 3]."""
     to_run: Frame | None = field(default=None, compare=False)
     """From the frame of the photos' poses."""
-    made_for: Callable[[TrainingConfig], MadeFor] | None = field(default=None, compare=False)
-    """What a run on this, with such options, is made for."""
+    capture: DataparserOutputs | None = field(default=None, compare=False)
+    """The photos to train on and their cameras."""
 
     @property
     def pixels(self) -> int:
         """Of the largest photo."""
         return self.size[0] * self.size[1]
+
+    def made_for(self, training: TrainingConfig) -> MadeFor:
+        """What a run on this, with such options, is made for."""
+        return MadeFor.of(self.capture.image_filenames, views_of(self.capture.cameras), training)
 
     def in_words(self) -> str:
         """One line for the terminal."""
@@ -71,9 +74,7 @@ def inspect(config: DataParserConfig) -> Inspected:
     train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
     cloud = np.asarray(parts[0].metadata.get("points3D_xyz", np.zeros((0, 3))))
     to_run = Frame.of(parts[0].dataparser_transform, parts[0].dataparser_scale)
-    photos, cameras = parts[0].image_filenames, parts[0].cameras
-    made_for = lambda training: MadeFor.of(photos, views_of(cameras), training)  # noqa: E731 - rarely asked
-    return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run, made_for)
+    return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run, parts[0])
 
 
 def splats_to_begin_with(model: AbcdModelConfig, training: TrainingConfig, found: Inspected) -> int:

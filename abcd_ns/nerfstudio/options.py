@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -14,7 +13,6 @@ import tyro
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
@@ -25,6 +23,7 @@ from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
 from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, UNUSED_OF_VIEWER, hidden, named_too, shown
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
+from abcd_ns.run.options import check_not_below_0
 
 MIRRORED = {
     "sh_degree": "sh_degree",
@@ -117,28 +116,19 @@ HIDDEN = tuple(
     if option.name not in HONOURED and not option.name.startswith("_")
 )
 """Options of splatfacto's model that have no effect, or are set under other names."""
-_BUDGETS = ("device_budget_gb", "gaussian_bytes", "ram_budget_gb", "datamanager.photo_cache_gb")
-NOT_BELOW_0 = ("blocks", "near_plane", "model.num_random", "model.random_scale", *_BUDGETS)
+NOT_BELOW_0 = ("model.num_random", "model.random_scale", "datamanager.photo_cache_gb")
 
 
 def check_options(config: TrainerConfig) -> None:
     """Raise a UserError if an option is out of range or has no effect, or two contradict each other."""
     pipeline = config.pipeline
+    pipeline.check_ranges()
     for name in NOT_BELOW_0:
-        value = attrgetter(name)(pipeline)
-        if not 0 <= value < math.inf:
-            flag = name.replace("_", "-")
-            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")
+        check_not_below_0(pipeline, name)
     if config.max_num_iterations < 1:
         raise UserError(f"--max-num-iterations must be 1 or more, not {config.max_num_iterations}.")
-    if pipeline.blocks > MAX_BLOCKS:
-        raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {pipeline.blocks}.")
-    if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:
-        refused = f"--pipeline.max-seconds must be above 0 and finite, not {pipeline.max_seconds}"
-        raise UserError(f"{refused}; leave it out for no limit.")
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
-    pipeline.training.check()
     if pipeline.training.recipe.overlap > 0 and pipeline.blocks == pipeline.gaussian_bytes == 0:
         raise UserError("abcd-partition cuts no block that outgrows the device: give --pipeline.blocks.")
     check_workers(config)

@@ -21,8 +21,6 @@ def check_workers(config: TrainerConfig) -> None:
     """Raise a UserError if workers are of no use, or cannot be had."""
     pipeline = config.pipeline
     workers, cluster, blocks = pipeline.workers, pipeline.cluster, pipeline.blocks
-    if workers < 0:
-        raise UserError(f"--pipeline.workers must be 0 or more, not {workers}.")
     if cluster is not None and not workers:
         raise UserError(f"--pipeline.cluster {cluster} needs a number of workers: add --pipeline.workers.")
     if workers <= 1 and cluster is None:

@@ -1,7 +1,6 @@
 """Training and rendering from Python: the engine without nerfstudio."""
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -145,12 +144,9 @@ def _check(
     device: torch.device,
     folder: Path,
 ) -> None:
-    options.training.check()
-    for name in ("blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb", "workers"):
-        if not 0 <= (value := getattr(options, name)) < math.inf:
-            raise UserError(f"options.{name} must be 0 or more and finite, not {value}.")
-    if steps < 1 or (options.max_seconds is not None and not options.max_seconds > 0):
-        raise UserError("steps must be at least 1, and options.max_seconds above 0.")
+    options.check_ranges()
+    if steps < 1:
+        raise UserError(f"steps must be at least 1, not {steps}.")
     if manifest_path(folder).exists():
         raise UserError(f"{folder} holds a run already: choose another folder for `out`.")
     if len(views) != len(photos) or not views:

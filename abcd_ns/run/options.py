@@ -1,9 +1,15 @@
 """The options of a run, beside those of training itself."""
 
+import math
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal
 
+from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.errors import UserError
+
+NOT_BELOW_0 = ("blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb", "workers")
 
 
 @dataclass
@@ -38,3 +44,21 @@ class RunOptions:
     The folders of data and outputs must be paths that all its machines see."""
     max_seconds: float | None = None
     """Stop after this many seconds of training. Evaluation and saving do not count."""
+
+    def check_ranges(self) -> None:
+        """Look for options that are out of range, those of training too; a UserError names the first."""
+        for name in NOT_BELOW_0:
+            check_not_below_0(self, name)
+        if self.blocks > MAX_BLOCKS:
+            raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {self.blocks}.")
+        if self.max_seconds is not None and not 0 < self.max_seconds < math.inf:
+            refused = f"--pipeline.max-seconds must be above 0 and finite, not {self.max_seconds}"
+            raise UserError(f"{refused}; leave it out for no limit.")
+        self.training.check()
+
+
+def check_not_below_0(options: object, name: str) -> None:
+    """Raise a UserError if a number, by its dotted name, is below 0 or not finite."""
+    if not 0 <= (value := attrgetter(name)(options)) < math.inf:
+        flag = name.replace("_", "-")
+        raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")

@@ -77,6 +77,7 @@ def test_it_trains_as_ns_train_does(tmp_path):
         ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
         ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
         ({"options": RunOptions(blocks=-1)}, "blocks must be 0 or more"),
+        ({"options": RunOptions(blocks=65_537)}, "blocks must be 65536 or less"),
         ({"steps": 0}, "at least 1"),
         ({"options": RunOptions(max_seconds=0.0)}, "above 0"),
     ],
