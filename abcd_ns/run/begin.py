@@ -17,6 +17,7 @@ from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.gaussians.initialize import PointCloud, cloud_from_points, split_off, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer, loss
+from abcd_ns.engine.space.distances import mean_share_seen
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -172,9 +173,10 @@ def _new_store(
     blocks, fitted = options.blocks, {name: getattr(training.limits, name) for name in FITTED}
     if blocks == 0:
         allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), on_cpu)
-        say(allowed.in_words())
         workers = options.workers if fit.has_workers(options) else 0
-        blocks, fitted = fit.blocks_to_begin_with(allowed, workers), allowed.limits
+        seen = mean_share_seen(capture.views, cloud.means) if capture.points else 1.0
+        blocks, fitted = fit.blocks_to_begin_with(allowed, workers, seen), allowed.limits
+        say(replace(allowed, blocks=blocks).in_words())
     if options.partition == "kd":
         tree = build_kd(cloud.means, blocks)
     else:

@@ -11,7 +11,7 @@ import torch
 
 from abcd_ns import RunOptions, TrainingConfig, UserError, train
 from abcd_ns.cli.export.command import export
-from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.events import StepTaken, VisitEnded
 from abcd_ns.nerfstudio.views import views_of
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
@@ -101,3 +101,27 @@ def test_photos_of_double_precision_train_as_those_of_single(tmp_path):
     double = train(views, [photo.double() for photo in photos], points, tmp_path / "double", steps=2)
     for (_, one), (_, other) in zip(single.gaussians.items(), double.gaussians.items(), strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(("sites", "expected"), [(2, {0}), (20, {0, 1})])
+def test_a_scene_of_which_views_see_little_is_trained_in_two_blocks(tmp_path, sites, expected):
+    views, points, visited = [], [], set()
+    for site in range(sites):
+        away = torch.tensor([0.0, 20.0 * site, 0.0])  # cameras look along x
+        points.append(torch.rand(40, 3, generator=torch.Generator().manual_seed(site)) - 0.5 + away)
+        for view in ring_of_views(2):
+            viewmat = view.viewmat.clone()
+            viewmat[:3, 3] -= viewmat[:3, :3] @ away
+            views.append(dataclasses.replace(view, viewmat=viewmat))
+    photos, points = [torch.zeros(36, 48, 3)] * len(views), torch.cat(points)
+    options = RunOptions(training=TrainingConfig(warmup=0.0))
+    train(
+        views,
+        photos,
+        (points, torch.zeros_like(points)),
+        tmp_path / "out",
+        steps=400,
+        options=options,
+        listener=lambda event: visited.add(event.block) if isinstance(event, VisitEnded) else None,
+    )
+    assert visited == expected

@@ -17,6 +17,7 @@ from abcd_ns.cli.plan.wanted import Wanted
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
 from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.space.distances import mean_share_seen
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, needs_of
@@ -56,6 +57,8 @@ class Capture:
     views: list[View]
     factor: int = 1
     """By which the photos were reduced."""
+    seen: float = 1.0
+    """Share of the points that a view sees; 1 where they are random."""
 
 
 def read(data: Path, downscale: int | None, console: Console) -> Capture:
@@ -68,11 +71,13 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
         options = methods.abcd.config.pipeline
         seeds = dataset.metadata.get("points3D_xyz"), dataset.metadata.get("points3D_rgb")
         views = training_views(dataset.cameras, seeds[0])
+        factor = manager.dataparser.factor
         if seeds[0] is None:  # as training begins then
-            seeds = random_points(options.model.num_random, options.model.random_scale)
-        else:
-            seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
-        return Capture(*seeds, views, manager.dataparser.factor)
+            return Capture(
+                *random_points(options.model.num_random, options.model.random_scale), views, factor
+            )
+        seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
+        return Capture(*seeds, views, factor, mean_share_seen(views, seeds[0]))
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     pixels = max(view.full.pixels for view in views)
     most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
     demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
-    fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted)
+    fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted, capture.seen)
     training = replace(training, limits=replace(training.limits, **fit.limits))
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
@@ -178,13 +183,14 @@ def _limited(capture: Capture, most: int, seed: int) -> Capture:
     return replace(capture, points=capture.points[rows], colors=capture.colors[rows])
 
 
-def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
+def _fit(budget: int, demand: Demand, wanted: Wanted, seen: float) -> Fit:
     """As training has it: blocks whose number is given are as large as they become."""
     if wanted.blocks:
         limits = demand.training.limits
         return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, limits.crop_pixels, limits.batch_limit)
     fit = find_fit(budget, demand, downscale="--downscale", memory="--device-budget-gb")
-    return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
+    workers = wanted.workers if wanted.workers > 1 else 0
+    return replace(fit, blocks=blocks_to_begin_with(fit, workers, seen))
 
 
 def in_words(hours: float) -> str:

@@ -1,4 +1,4 @@
-"""Distances that the points of a capture tell: from where on it is drawn, and how far views see.
+"""What the points of a capture tell of its views: from where on they are drawn, how far and how much they see.
 
 Gaussians right before a camera cover all of its picture. In a view that is trained on they are soon gone; a
 view that is not, from a place that no photo was taken from, may be lost to a handful of them, though each
@@ -10,7 +10,7 @@ from dataclasses import replace
 from statistics import median
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from abcd_ns.engine.types import NEAR_PLANE, View, centers_of
@@ -35,7 +35,7 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
         points: of the sparse reconstruction, world units.
         near: from where on they see, world units; 0 takes half the nearest distance of a point in any view.
     """
-    points, extent = points[:: -(-len(points) // MOST_POINTS) or 1].double(), _extent(views)
+    points, extent = _some(points), _extent(views)
     found: dict[int, tuple[float, float]] = {}
     for view in views:
         depths, seen = replace(view, near=0.0).depths_of(points)
@@ -50,6 +50,17 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
         replace(view, near=near, nearest=nearest, reach=min(extent, FARTHER * distance))
         for view, nearest, distance in known
     ]
+
+
+def mean_share_seen(views: Sequence[View], points: Float[Tensor, "n 3"]) -> float:
+    """Share of the points (world space) that a view sees in the mean, whatever hides them; 0 without points."""
+    points = _some(points)
+    return sum(int(view.depths_of(points)[1].sum()) for view in views) / max(len(views) * len(points), 1)
+
+
+def _some(points: Float[Tensor, "n 3"]) -> Float64[Tensor, "m 3"]:
+    """At most MOST_POINTS of them."""
+    return points[:: -(-len(points) // MOST_POINTS) or 1].double()
 
 
 def _extent(views: Sequence[View]) -> float:
