@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
 
 import torch
 import tyro
@@ -106,6 +107,8 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """Unused, see UNUSED. nerfstudio prints a line where it is "gpu"."""
     photo_cache_gb: float = 0.0
     """RAM for decoded photos, GiB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
+    poses: ClassVar[Mapping[int, torch.Tensor]] = MappingProxyType({})
+    """Refined poses of a run that was opened; `ns-render dataset` makes more datamanagers of this config."""
 
     def __post_init__(self) -> None:
         if self.data_format is None:
@@ -146,6 +149,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         self._eval_order = random.Random(0)
         cameras = self.train_dataset.cameras
         self._camera = lru_cache(SELECTED)(lambda row: cameras[row : row + 1])
+        self.take_poses(config.poses)
 
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""

@@ -187,6 +187,7 @@ class AbcdPipeline(VanillaPipeline):
         with as_a_command():
             super().load_pipeline(loaded_state, step)
             check_box(sys.argv, self.model.means)
+        self.config.datamanager.poses = self.model.poses
         self.datamanager.take_poses(self.model.poses)
 
     def _before_evaluation(self) -> None:

@@ -5,9 +5,11 @@ import json
 import pytest
 import torch
 from nerfstudio.scripts.exporter import ExportCameraPoses
+from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 
 from abcd_ns.engine.train.step import pose_rounds
+from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.views import views_of
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HELD_OUT, VIEWS, write_scene
@@ -52,3 +54,15 @@ def test_ns_export_cameras_writes_refined_poses(trained, tmp_path):
     cameras = eval_setup(trainer.base_dir / "config.yml")[1].datamanager.train_dataset.cameras
     assert torch.equal(torch.tensor([frame["transform"] for frame in frames]), cameras.camera_to_worlds)
     assert len(json.loads((tmp_path / "out" / "transforms_eval.json").read_text())) > 0
+
+
+def test_ns_render_dataset_draws_from_refined_poses(trained, tmp_path, monkeypatch):
+    """Its cameras come from a datamanager of its own."""
+    trainer, _ = trained
+    config, drawn, view = trainer.base_dir / "config.yml", [], AbcdModel.view
+    monkeypatch.setattr(AbcdModel, "view", lambda self, camera: (drawn.append(camera), view(self, camera))[1])
+    options = {"rendered_output_names": ["rgb"], "image_format": "png", "split": "train+test"}
+    DatasetRender(load_config=config, output_path=tmp_path, **options).main()
+    manager = eval_setup(config)[1].datamanager
+    known = [matrices(dataset.cameras) for dataset in (manager.train_dataset, manager.eval_dataset)]
+    assert torch.equal(torch.cat([matrices(camera) for camera in drawn]), torch.cat(known))
