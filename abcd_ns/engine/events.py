@@ -160,7 +160,7 @@ class HeldOutScored:
     psnr: float
     """dB."""
     ssim: float | None
-    """None where pictures are smaller than SSIM's window."""
+    """None where it was not measured."""
 
 
 Event = (

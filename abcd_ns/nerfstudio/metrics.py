@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Bool, Float
 from pytorch_msssim import ssim
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from abcd_ns.engine.render.loss import SSIM_WINDOW, psnr
 from abcd_ns.errors import UserError
 
 ALEXNET = "alexnet-owt-7be5be79.pth"
 """The file of AlexNet's weights, as torchvision names it in torch's hub folder."""
+LEAST_LPIPS = 31  # pixels along a side, of which AlexNet's layers leave something
 FETCH = "ABCD_FETCH_LPIPS"
 """The environment variable that allows torchvision to download them; ns-eval has no options for it."""
 
@@ -26,21 +28,26 @@ def image_metrics(
 ) -> dict[str, float]:
     """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`; `cc_psnr` if `corrected`.
 
-    Pictures smaller than SSIM's window have none. With a mask, PSNRs are of the pixels where it is true, and
-    the others of pictures that are black elsewhere.
+    Sides shorter than SSIM's window, or LEAST_LPIPS, are stretched to it. With a mask, PSNRs are of the
+    pixels where it is true, and the others of pictures that are black elsewhere.
     """
     a, b = (image.permute(2, 0, 1)[None] for image in (rendered, photo))
     if mask is not None:
         a, b = (image * mask[..., 0].to(image.device) for image in (a, b))
         rendered, photo = counted(rendered, mask), counted(photo, mask)
-    found = {"psnr": float(psnr(rendered, photo))}
-    if min(a.shape[2:]) >= SSIM_WINDOW:
-        found["ssim"] = float(ssim(a, b, data_range=1.0, size_average=True))
+    similar = ssim(*_of_size(SSIM_WINDOW, a, b), data_range=1.0, size_average=True)
+    found = {"psnr": float(psnr(rendered, photo)), "ssim": float(similar)}
     if corrected:
         found["cc_psnr"] = corrected_psnr(rendered, photo)
     if lpips_missing() is None:
-        found["lpips"] = float(_lpips(str(rendered.device))(a.clamp(0, 1), b.clamp(0, 1)))
+        pair = _of_size(LEAST_LPIPS, a.clamp(0, 1), b.clamp(0, 1))
+        found["lpips"] = float(_lpips(str(rendered.device))(*pair))
     return found
+
+
+def _of_size(least: int, *images: Float[Tensor, "1 3 h w"]) -> list[Float[Tensor, "1 3 _h _w"]]:
+    """Images with sides of `least` pixels or more; shorter ones are stretched by repeating pixels."""
+    return [interpolate(image, [max(side, least) for side in image.shape[2:]]) for image in images]
 
 
 def counted(picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w 1"] | None) -> Float[Tensor, "_h _w 3"]:

@@ -28,6 +28,16 @@ def test_hidden_pixels_are_not_scored():
     assert found == image_metrics(torch.where(mask, picture, 1.0), photo, mask=mask)
 
 
+@pytest.mark.parametrize("size", [(10, 30), (30, 7), (2, 2), (1, 1)])
+def test_pictures_smaller_than_the_window_of_ssim_have_the_scores_of_others(size):
+    """Else one of them among held-out photos is a KeyError in nerfstudio's mean."""
+    photo = torch.rand(*size, 3, generator=torch.Generator().manual_seed(0))
+    found = image_metrics(photo, photo)
+    assert found.keys() == image_metrics(torch.zeros(20, 30, 3), torch.zeros(20, 30, 3)).keys()
+    assert found["ssim"] == pytest.approx(1)
+    assert image_metrics(1 - photo, photo)["ssim"] < 0.95
+
+
 def test_black_pictures_are_scored_too():
     black = torch.zeros(20, 30, 3)
     assert image_metrics(black, black + 0.5, corrected=True)["cc_psnr"] > 0

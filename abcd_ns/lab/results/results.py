@@ -37,7 +37,7 @@ class ViewScore:
     """The photo's file name."""
     psnr: float
     ssim: float | None
-    """None where the picture is smaller than SSIM's window."""
+    """None in files of older versions, where the picture is smaller than SSIM's window."""
     lpips: float | None
     psnr_merged: float
     ssim_merged: float | None

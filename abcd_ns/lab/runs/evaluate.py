@@ -46,8 +46,8 @@ class Drawn:
         composited, merged = (
             image_metrics(picture, self.photo, mask=self.mask) for picture in (self.composited, self.merged)
         )
-        scores = (composited["psnr"], composited.get("ssim"), composited.get("lpips"))
-        return ViewScore(self.row, self.name, *scores, merged["psnr"], merged.get("ssim"))
+        scores = (composited["psnr"], composited["ssim"], composited.get("lpips"))
+        return ViewScore(self.row, self.name, *scores, merged["psnr"], merged["ssim"])
 
     @property
     def squared_gap(self) -> float:
