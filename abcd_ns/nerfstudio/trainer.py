@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -193,6 +193,9 @@ class AbcdTrainer(Trainer):
         """As nerfstudio's; what the user can repair ends the process with one line and code 2."""
         with at_once(partial(self._say_end, "Stopped before training began.")), exit_on_user_error():
             super().setup(*args, **kwargs)
+        if self.resumed_from:  # later ones are of steps that it went back from
+            newest = pin_name(max(self.resumed_from.step - 1, 0))
+            self._drop_checkpoints(lambda name: name > newest)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
         at = TrainingCallbackLocation
         hold = TrainingCallback([at.BEFORE_TRAIN_ITERATION], lambda step: self._signals.hold())  # noqa: ARG005
@@ -344,11 +347,16 @@ class AbcdTrainer(Trainer):
         _save_atomically({"step": step, "pipeline": self.pipeline.state_dict(), **state}, path)
         crash_points.reached(crash_points.CHECKPOINT_IN_PLACE)
         if self.config.save_only_latest_checkpoint:
-            for old in {*self.checkpoint_dir.glob("step-*.ckpt")} - {path}:
-                old.unlink(missing_ok=True)
-            store = coordinator.scene.store
-            for pin in {*store.pins} - {path.stem}:
-                store.unpin(pin)
+            self._drop_checkpoints(lambda name: name != path.stem)
+
+    def _drop_checkpoints(self, dropped: Callable[[str], bool]) -> None:
+        """Remove checkpoints and pins by their names, which sort by step."""
+        for path in self.checkpoint_dir.glob("step-*.ckpt"):
+            if dropped(path.stem):
+                path.unlink(missing_ok=True)
+        store = self.pipeline.coordinator.scene.store
+        for pin in filter(dropped, store.pins):
+            store.unpin(pin)
 
 
 def _save_atomically(state: dict[str, Any], path: Path) -> None:

@@ -119,6 +119,26 @@ def test_the_very_folder_can_go_back_to_a_checkpoint(data, stopped, undisturbed)
     assert_same(stopped, undisturbed)
 
 
+def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_path, undisturbed):
+    """ns-eval would open these, and not what the run has come to since."""
+    options = {"save_only_latest_checkpoint": False}
+    folder = run(configure(data, tmp_path, **options), stop_after=34).base_dir
+    assert saved(folder) == [10, 20, 30]
+    run(configure(data, tmp_path, load_dir=folder, load_step=10, **options), stop_after=14)
+    assert saved(folder) == [10]
+    resumed = run(configure(data, tmp_path, load_dir=folder, **options))
+    assert resumed.resumed_from.step < 20
+    assert saved(folder) == [10, 20, 30, STEPS - 1]
+    assert_same(folder, undisturbed)
+
+
+def saved(folder: Path) -> list[int]:
+    """The steps of a run's checkpoints, each of which has a pin."""
+    names = sorted(path.stem for path in (folder / "nerfstudio_models").iterdir())
+    assert sorted(ParameterStore.open(folder / "abcd/store", read_only=True).pins) == names
+    return [int(name.removeprefix("step-")) for name in names]
+
+
 # Signals
 
 
