@@ -117,10 +117,11 @@ def begin_run(
         fitted = {name: store.header.get(name, 0) for name in (*FITTED, COARSE_MODEL)}
         asked = _memory_asked(options)
         if start is not None and any(asked) and asked != store.header.get(MEMORY):
-            # It resumes with a budget of its own; else it keeps the limits that it began with.
+            # It resumes with another budget; else it keeps the limits of the last.
             there, blocks = sum(map(store.counts, range(tree.num_blocks))), tree.num_blocks
             photos = capture.pixels, capture.factor
             fitted |= fit.fit_run(options, device_bytes, *photos, there, on_cpu, blocks).limits
+            store.commit({}, header={**store.header, **fitted, MEMORY: asked})
         training = replace(training, limits=replace(training.limits, **fitted))
         if start is not None:
             state = RunState.from_json(store.state)

@@ -15,8 +15,8 @@ from abcd_ns.errors import UserError
 
 MADE_FOR = "made for"
 ASKED, MEMORY = "blocks asked for", "memory asked for"
-"""Entries of a store's header: what can resume it, and of the run that began it `--pipeline.blocks`, and
-`device-budget-gb` and `gaussian-bytes`."""
+"""Entries of a store's header: what can resume it, `--pipeline.blocks` of the run that began it, and the
+`device-budget-gb` and `gaussian-bytes` that its limits follow from."""
 
 
 @dataclass(frozen=True)

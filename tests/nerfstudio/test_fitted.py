@@ -40,7 +40,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
-def test_a_run_that_resumes_with_the_budget_it_began_with_keeps_its_limits(data, tmp_path, monkeypatch):
+def test_a_run_that_resumes_with_the_budget_it_has_keeps_its_limits(data, tmp_path, monkeypatch):
     """By the Gaussians that have come since, the same budget would give others, or be refused."""
 
     def begun(name: str, budget: float, stop_after: int, **options) -> AbcdTrainer:
@@ -55,3 +55,7 @@ def test_a_run_that_resumes_with_the_budget_it_began_with_keeps_its_limits(data,
     limits = [trainer.pipeline.coordinator.config.limits.sole_limit for trainer in (same, other)]
     assert limits[0] == FIT.sole
     assert limits[1] != FIT.sole
+    later = begun("without", 0.0, 13, load_dir=other.base_dir)
+    assert later.pipeline.coordinator.config.limits.sole_limit == limits[1]
+    more = begun("with more", 4.0, 15, load_dir=later.base_dir)
+    assert more.pipeline.coordinator.config.limits.sole_limit > limits[1]
