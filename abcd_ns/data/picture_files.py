@@ -4,14 +4,16 @@ import os
 import stat
 import unicodedata
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
-from typing import Literal
+from typing import Literal, TypeVar
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from abcd_ns.data.input_errors import InputError
+
+T = TypeVar("T")
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"})
 """What counts as a photo when a folder is listed."""
@@ -62,13 +64,9 @@ class FileFinder:
         leaves = "\0" in name or not path.is_relative_to(self._root)
         if not leaves and os.path.lexists(path):
             return path
-        parts = [part for part in PureWindowsPath(name).parts if part != ".."]
-        for start in range(len(parts) if moved else 1):
-            key = _loosely("/".join(parts[start:]))
-            meant = self._files.get(key) or self._files.get(_without_ending(key), [])
-            if len(meant) == 1:
-                self._renamed[name] = meant[0]
-                return meant[0]
+        if (meant := meant_by(name, self._files, moved)) is not None:
+            self._renamed[name] = meant
+            return meant
         if leaves:
             leads = f"the path {name} leads out of {self.folder}"
             raise InputError(f"{self.said_by}: {leads}; move the file inside.")
@@ -84,14 +82,31 @@ class FileFinder:
         return [f"{self.said_by}: {len(self._renamed)} files have other names ({example}, ...)."]
 
     @cached_property
-    def _files(self) -> dict[str, list[Path]]:
-        """All files by their path inside the folder, and pictures by it without the ending, too."""
-        found: dict[str, list[Path]] = {}
-        for path in visible_files(self._root):
-            key = _loosely(path.relative_to(self._root).as_posix())
-            for each in {key, _without_ending(key)}:
-                found.setdefault(each, []).append(path)
-        return found
+    def _files(self) -> dict[str, set[Path]]:
+        """All files, by their path inside the folder."""
+        paths = visible_files(self._root)
+        return by_loose_name((path.relative_to(self._root).as_posix(), path) for path in paths)
+
+
+def by_loose_name(named: Iterable[tuple[str, T]]) -> dict[str, set[T]]:
+    """What has a name, for `meant_by`; pictures by their names without the ending, too."""
+    found: dict[str, set[T]] = {}
+    for name, thing in named:
+        key = _loosely(name)
+        for each in {key, _without_ending(key)}:
+            found.setdefault(each, set()).add(thing)
+    return found
+
+
+def meant_by(name: str, found: Mapping[str, set[T]], moved: bool = True) -> T | None:
+    """The only one whose name differs from `name` as `FileFinder.find` says; None if none or several do."""
+    parts = [part for part in PureWindowsPath(name).parts if part != ".."]
+    for start in range(len(parts) if moved else 1):
+        key = _loosely("/".join(parts[start:]))
+        meant = found.get(key) or found.get(_without_ending(key), ())
+        if len(meant) == 1:
+            return next(iter(meant))
+    return None
 
 
 def visible_files(folder: Path) -> Iterator[Path]:

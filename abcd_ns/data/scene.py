@@ -10,6 +10,7 @@ import numpy as np
 
 from abcd_ns.data import OPTION
 from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.picture_files import by_loose_name, meant_by
 
 MAX_SIDE = 100_000  # pixels along one side beyond which a width or height is taken for a broken file
 MAX_COORDINATE = 1e12  # world units beyond which a camera's place is taken for a broken file
@@ -161,8 +162,8 @@ def split_lists(
     """The lists that there are as one split, or why they are none; None without any. What is held out is val
     and test together. If only one side is listed, the other is all the rest.
 
-    `found` is what each list names, `known` the name of each frame by what lists call it; `label` gives what
-    messages call the list of a split.
+    `found` is what each list names, `known` the name of each frame by what lists call it, or nearly, as files
+    are found by FileFinder; `label` gives what messages call the list of a split.
     """
     try:
         return _one_split(found, known, label) if found else None
@@ -174,14 +175,16 @@ def _one_split(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
 ) -> SplitLists:
     problems, everything, fix = Problems(), frozenset(known.values()), f"set {OPTION}eval-mode interval"
+    loose = by_loose_name(known.items())
+    called = {name: known.get(name) or meant_by(name, loose) for names in found.values() for name in names}
     for split, names in found.items():
-        unknown = [name for name in dict.fromkeys(names) if name not in known]
+        unknown = [name for name in dict.fromkeys(names) if called[name] is None]
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
             problems.append(f"{label(split)} names {photos} without a pose ({few}); correct it, or {fix}.")
     problems.raise_if_any()
-    listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
+    listed = {split: frozenset(called[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
     train = listed.get("train", everything - held_out)
     if listed.keys() == {"train"}:

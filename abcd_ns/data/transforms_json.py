@@ -112,9 +112,7 @@ def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folde
             raise InputError(f"{path}: {key} must be a list of file_paths.")
         if key in meta:
             found[split] = [os.path.normpath(name) for name in listed]
-    photos = called.values()
-    # As for the frames' own file_paths, the ending may be left out.
-    called = {photo.removesuffix(".png"): photo for photo in photos} | called | {p: p for p in photos}
+    called = called | {photo: photo for photo in called.values()}
     known = {call: os.path.relpath(photo, folder) for call, photo in called.items()}
     return split_lists(found, known, lambda split: f"{path}: {split}_filenames")
 

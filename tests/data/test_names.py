@@ -58,16 +58,16 @@ def test_transforms_of_other_machines_find_their_photos(scene, called):
     assert {path.relative_to(scene).as_posix() for path in tested} == set(wanted)
 
 
-@pytest.mark.parametrize(
-    "called",
-    [
-        lambda name: name.replace("/", "\\"),
-        lambda name: WINDOWS + name.replace("/", "\\"),
-        lambda name: f"images/{name}",
-        lambda name: name.upper(),
-        lambda name: name.replace(".png", ".jpeg"),
-    ],
-)
+OTHERWISE = [
+    lambda name: name.replace("/", "\\"),
+    lambda name: WINDOWS + name.replace("/", "\\"),
+    lambda name: f"images/{name}",
+    lambda name: name.upper(),
+    lambda name: name.replace(".png", ".jpeg"),
+]
+
+
+@pytest.mark.parametrize("called", OTHERWISE)
 def test_models_of_other_machines_find_their_photos(tmp_path, called, capsys):
     write_model(tmp_path / "sparse/0", names=[called(name) for name in NAMES])
     write_photos(tmp_path / "images")
@@ -75,6 +75,17 @@ def test_models_of_other_machines_find_their_photos(tmp_path, called, capsys):
     assert paths_of(tmp_path) == IMAGES
     assert re.search(r"10 files have other names \(.*\)", capsys.readouterr().out)
     assert len(parser(tmp_path).get_dataparser_outputs("test").image_filenames) == 1
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+@pytest.mark.parametrize("called", OTHERWISE)
+def test_lists_of_other_machines_find_their_photos(scene, kind, called):
+    if kind == "colmap":
+        (scene / "test_list.txt").write_text(f"{called(NAMES[3])}\n")
+    else:
+        write_transforms(scene, test_filenames=[called(f"images/{NAMES[3]}")])
+    held_out = parser(scene).get_dataparser_outputs("test").image_filenames
+    assert held_out == [scene / "images" / NAMES[3]]
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
