@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import FileFinder, check_regular
+from abcd_ns.data.picture_files import FileFinder, check_regular, check_two_files
 from abcd_ns.data.ply import read_points
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, read_list_files, rigid
 
@@ -76,9 +76,12 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
         with problems.collect(name=name):
             if camera not in lenses:
                 raise InputError(f"{label} uses camera {camera}, {lacks}; make the model again.")
-            called[name] = files.find(name).relative_to(os.path.abspath(photos)).as_posix()
-            pose = _camera_to_world(quat, translation, label)
-            frames.append(Frame(called[name], pose, lenses[camera], hidden and _mask(hidden, called[name])))
+            photo = files.find(name)
+            called[name] = photo.relative_to(os.path.abspath(photos)).as_posix()
+            pose, mask = _camera_to_world(quat, translation, label), None
+            if hidden and not (mask := _mask(hidden, called[name], photo)) and _mask(hidden, called[name]):
+                check_two_files(photo, name, photo.name)
+            frames.append(Frame(called[name], pose, lenses[camera], mask))
     if hidden and frames and not any(frame.mask_path for frame in frames):
         lacks = "has no mask" if hidden.folder.is_dir() else "does not exist, nor a mask"
         problems.append(f"{hidden.folder} {lacks} such as {frames[0].name}.png; put masks there.")
@@ -119,11 +122,10 @@ def _photo_folder(data: Path, images: Path, names: list[str]) -> Path:
     return data if is_flat else photos
 
 
-def _mask(files: FileFinder, name: str) -> Path | None:
-    for each in (str(Path(name).with_suffix(".png")), f"{name}.png"):
-        if (path := files.find(each, moved=False)).exists():
-            return path
-    return None
+def _mask(files: FileFinder, name: str, photo: Path | None = None) -> Path | None:
+    """The mask of that name, which is not `photo`."""
+    paths = (files.find(each, moved=False) for each in (str(Path(name).with_suffix(".png")), f"{name}.png"))
+    return next((path for path in paths if path != photo and path.exists()), None)
 
 
 def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> np.ndarray:

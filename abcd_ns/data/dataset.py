@@ -18,7 +18,7 @@ from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
-from abcd_ns.data.picture_files import FileFinder, check_complete, read_size
+from abcd_ns.data.picture_files import FileFinder, check_complete, check_two_files, read_size
 from abcd_ns.data.scene import Lens, distorted_lens
 from abcd_ns.data.undistort import undistortion
 
@@ -82,6 +82,8 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             stored = lens.size
             if needs_photos:
                 path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
+                if outputs.mask_filenames and path == outputs.mask_filenames[row].absolute():
+                    check_two_files(path, outputs.image_filenames[row].name, path.name)
                 stored = read_size(path)
                 check_complete(path)
                 if not reduces_to(stored, lens.size):

@@ -56,9 +56,12 @@ def _hint(scene: Scene) -> str:
     for above in root.absolute().parents[:3]:
         if (above / IMAGES / name).exists():
             return f", or give --data {above}"
-    for path in map(Path.as_posix, visible_files(root)):
-        if path.endswith(f"/{name}"):
-            return f", or set {OPTION}images-path {os.path.relpath(path.removesuffix(name), root)}"
+    masks = {frame.mask_path for frame in scene.frames}
+    for path in visible_files(root):
+        folder = os.path.relpath(path.as_posix().removesuffix(name), root)
+        is_mask = "mask" in folder.lower() or path.absolute() in masks
+        if path.as_posix().endswith(f"/{name}") and not is_mask:
+            return f", or set {OPTION}images-path {folder}"
     return ""
 
 

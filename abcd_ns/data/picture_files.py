@@ -44,6 +44,12 @@ def check_regular(path: Path, kind: str = "photo") -> None:
         raise InputError(f"{path} is empty; copy the {kind} again.")
 
 
+def check_two_files(found: Path, photo: str, mask: str) -> None:
+    """Refuse one file that was found for both a photo and its mask, if their names end otherwise."""
+    if PureWindowsPath(photo).suffix.lower() != PureWindowsPath(mask).suffix.lower():
+        raise InputError(f"{found} is all there is of {photo} and of its mask; copy both there.")
+
+
 class FileFinder:
     """Finds files of a folder by what another file, `said_by`, calls them, as written on another machine
     perhaps. No path leads out of the folder. The check is by name: a link inside may point anywhere."""

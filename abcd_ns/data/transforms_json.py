@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import FileFinder, read_size
+from abcd_ns.data.picture_files import FileFinder, check_two_files, read_size
 from abcd_ns.data.ply import read_points
 from abcd_ns.data.scene import SPLITS, Frame, Lens, Scene, SplitLists, distorted_lens, rigid, split_lists
 
@@ -144,7 +144,9 @@ def _frame(path: Path, files: FileFinder, meta: dict, entry: dict, number: int) 
     photo = files.find(name)
     pose = rigid(_matrix(entry["transform_matrix"], label), f"{label}: transform_matrix")
     lens = _lens(_camera_values(meta, entry), label, photo)
-    mask = files.find(str(entry["mask_path"])) if entry.get("mask_path") else None
+    mask = None
+    if entry.get("mask_path") and (mask := files.find(str(entry["mask_path"]))) == photo:
+        check_two_files(photo, name, str(entry["mask_path"]))
     # As nerfstudio has it, names are relative to the folder that transforms.json lies in.
     return Frame(os.path.relpath(photo, path.parent), pose, lens, mask)
 

@@ -95,6 +95,14 @@ def test_masks_come_along(photo):
     assert np.array_equal(AbcdDataset(outputs)[0]["mask"][..., 0], mask > 0)
 
 
+def test_a_mask_beside_a_missing_photo_is_not_taken_for_it(photo):
+    outputs = outputs_of(photo.with_suffix(".jpg"))
+    assert AbcdDataset(outputs).photos.sources[0].path == photo
+    outputs.mask_filenames = [photo]
+    with pytest.raises(InputError, match="is all there is of"):
+        AbcdDataset(outputs)
+
+
 def test_a_larger_photo_is_reduced_to_its_camera(photo):
     dataset = AbcdDataset(outputs_of(photo, fx=20.0, fy=20.0, cx=8.0, cy=6.0, width=16, height=12))
     whole = np.array(Image.open(photo)).astype(float)

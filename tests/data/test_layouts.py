@@ -12,7 +12,15 @@ from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.nerfstudio.inspection import inspect
-from tests.data.dataparser_scenes import NAMES, SIZES, parser, refusal, write_photos, write_transforms
+from tests.data.dataparser_scenes import (
+    NAMES,
+    SIZES,
+    parser,
+    refusal,
+    write_capture,
+    write_photos,
+    write_transforms,
+)
 
 
 def write_blender(folder: Path, splits: tuple[str, ...] = ("train", "val", "test")) -> Path:
@@ -63,6 +71,47 @@ def test_masks_of_a_colmap_model_are_found_by_name(scene, called):
     assert not mask[:, :9].any()
     assert mask[:, 9:].all()
     assert "mask" not in AbcdDataset(parser(scene).get_dataparser_outputs())[0]
+
+
+JPEGS = [name.replace(".png", ".jpg") for name in NAMES]
+
+
+def mask_beside(photo: Path, called: str) -> Path:
+    path = photo.with_name(called.format(stem=photo.stem, name=photo.name))
+    Image.new("L", Image.open(photo).size, 255).save(path)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+@pytest.mark.parametrize("called", ["{stem}.png", "{name}.png"])
+def test_a_mask_beside_a_missing_photo_is_not_taken_for_it(tmp_path, kind, called):
+    write_capture(tmp_path, names=JPEGS)
+    masks = [mask_beside(tmp_path / "images" / name, called) for name in JPEGS]
+    options = {"masks_path": Path("images")} if kind == "colmap" else {}
+    if kind == "transforms":
+        meta = write_transforms(tmp_path)
+        for frame in meta["frames"]:
+            photo = Path(frame["file_path"])
+            frame["mask_path"] = str(photo.with_name(called.format(stem=photo.stem, name=photo.name)))
+        (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    found = parser(tmp_path, eval_mode="all", **options).get_dataparser_outputs()
+    assert sorted(found.mask_filenames) == sorted(masks)
+    (tmp_path / "images" / JPEGS[3]).unlink()
+    assert f"{masks[3]} is all there is of " in refusal(tmp_path, **options)
+
+
+def test_a_photo_is_not_its_own_mask(scene):
+    mask = mask_beside(scene / "images" / NAMES[1], "{name}.png")
+    sources = parser(scene, masks_path=Path("images")).prepared().sources
+    assert {source.path: source.mask_path for source in sources if source.mask_path} == {
+        scene / "images" / NAMES[1]: mask
+    }
+
+
+@pytest.mark.parametrize(("folder", "options"), [("Masks", {}), ("hidden", {"masks_path": Path("hidden")})])
+def test_masks_are_not_offered_in_place_of_photos(scene, folder, options):
+    (scene / "images").rename(scene / folder)
+    assert "images-path" not in refusal(scene, **options)
 
 
 def test_folders_of_a_colmap_model_mean_nothing_to_transforms_json(scene):
