@@ -1,4 +1,4 @@
-"""What the points of a capture tell of its views: from where on they are drawn, how far and how much they see.
+"""What a capture's points tell of its views: from where on they are drawn, how far and how much they see.
 
 Gaussians right before a camera cover all of its picture. In a view that is trained on they are soon gone; a
 view that is not, from a place that no photo was taken from, may be lost to a handful of them, though each
@@ -53,7 +53,7 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
 
 
 def mean_share_seen(views: Sequence[View], points: Float[Tensor, "n 3"]) -> float:
-    """Share of the points (world space) that a view sees in the mean, whatever hides them; 0 without points."""
+    """Share of the points (world space) that a view sees in the mean, whatever hides them; 0 of none."""
     points = _some(points)
     return sum(int(view.depths_of(points)[1].sum()) for view in views) / max(len(views) * len(points), 1)
 
