@@ -8,9 +8,8 @@ spherical harmonic. A viewer that does not know it shows points in their colours
 import json
 import struct
 from collections.abc import Iterable
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,45 +31,26 @@ _LARGEST = 2**32  # bytes: the file tells its length in 32 bits
 _SPARE = 256  # bytes kept free in the JSON for the corners of the box, which are known last
 
 
-class Attribute(NamedTuple):
-    """What each Gaussian has, in `stride` bytes."""
-
-    name: str
-    kind: str
-    stride: int
-    component: int = _FLOAT
-
-
-def attributes(sh_degree: int) -> list[Attribute]:
-    """In the order of the file."""
-    harmonics = [f"SH_DEGREE_{n}_COEF_{k}" for n in range(sh_degree + 1) for k in range(2 * n + 1)]
-    return [
-        Attribute("POSITION", "VEC3", 12),
-        Attribute("COLOR_0", "VEC4", 4, _BYTE),
-        Attribute(f"{EXTENSION}:ROTATION", "VEC4", 16),
-        Attribute(f"{EXTENSION}:SCALE", "VEC3", 12),
-        Attribute(f"{EXTENSION}:OPACITY", "SCALAR", 4),
-        *(Attribute(f"{EXTENSION}:{name}", "VEC3", 12) for name in harmonics),
-    ]
-
-
-def values(gaussians: Gaussians) -> list[np.ndarray]:
-    """For `attributes`, each [n, width]."""
-    opacities = gaussians.opacities.sigmoid()
-    quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
-    found = [
-        gaussians.means,
-        quats[:, [1, 2, 3, 0]],
-        gaussians.scales.exp(),
-        opacities,
-        gaussians.features_dc,
-        *gaussians.features_rest.unbind(1),
-    ]
-    arrays = [value.float().cpu().numpy().astype("<f4") for value in found]
+def values(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """What the file has of each Gaussian, in its order: [n, width], float32, or uint8 of COLOR_0."""
+    opacities, sh_degree = gaussians.opacities.sigmoid(), gaussians.sh_degree
     srgb = (gaussians.features_dc * SH_C0 + 0.5).clamp(0, 1)
     linear = torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    color = torch.cat((linear, opacities), dim=1)
-    return [arrays[0], (color * 255).round().to(torch.uint8).cpu().numpy(), *arrays[1:]]
+    quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
+    found = {
+        "POSITION": gaussians.means,
+        "COLOR_0": torch.cat((linear, opacities), dim=1),
+        f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": gaussians.scales.exp(),
+        f"{EXTENSION}:OPACITY": opacities,
+    }
+    places = [(degree, k) for degree in range(sh_degree + 1) for k in range(2 * degree + 1)]
+    harmonics = (gaussians.features_dc, *gaussians.features_rest.unbind(1))
+    for (degree, k), harmonic in zip(places, harmonics, strict=True):
+        found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}"] = harmonic
+    arrays = {name: value.float().cpu().numpy().astype("<f4") for name, value in found.items()}
+    arrays["COLOR_0"] = (found["COLOR_0"] * 255).round().to(torch.uint8).cpu().numpy()
+    return arrays
 
 
 def write_glb(
@@ -83,14 +63,13 @@ def write_glb(
 ) -> None:
     """As `write_scene`; UserError where one file cannot hold them. A node of the file has `up`, and values
     stay as they are. `antialiased` is noted in extras; the extension has no field for it."""
-    columns = attributes(sh_degree)
-    starts = list(accumulate((column.stride * count for column in columns), initial=0))
-    document = _document(columns, starts, count, up)
+    document = _document(count, sh_degree, up)
     if antialiased:
         document["meshes"][0]["primitives"][0]["extras"] = {"antialiased": True}
     words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
     head = 12 + 8 + words + 8
-    total = head + starts[-1]
+    binary = document["buffers"][0]["byteLength"]
+    total = head + binary
     if total >= _LARGEST:
         raise UserError(f"{count:,} Gaussians: {bytes_in_words(total)}, and a .glb holds 4; use --by-block.")
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
@@ -98,25 +77,35 @@ def write_glb(
         file.truncate(total)
         for gaussians in parts:
             found = values(gaussians)
-            for column, start, value in zip(columns, starts, found, strict=False):
-                file.seek(head + start + done * column.stride)
+            for view, value in zip(document["bufferViews"], found.values(), strict=True):
+                file.seek(head + view["byteOffset"] + done * value.shape[1] * value.itemsize)
                 file.write(value.tobytes())
             done += len(gaussians)
-            low, high = np.minimum(low, found[0].min(0)), np.maximum(high, found[0].max(0))
+            means = found["POSITION"]
+            low, high = np.minimum(low, means.min(0)), np.maximum(high, means.max(0))
         document["accessors"][0] |= {"min": low.tolist(), "max": high.tolist()}
         file.seek(0)
         file.write(struct.pack("<4sIII4s", b"glTF", 2, total, words, b"JSON"))
         file.write(json.dumps(document).encode().ljust(words))
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        file.write(struct.pack("<I4s", binary, b"BIN\0"))
 
 
-def _document(
-    columns: list[Attribute], starts: list[int], count: int, up: Float[Tensor, "3 3"]
-) -> dict[str, Any]:
+def _document(count: int, sh_degree: int, up: Float[Tensor, "3 3"]) -> dict[str, Any]:
+    """The file's JSON: what it has, and where in the binary part."""
     w, x, y, z = quaternion(up).tolist()
+    columns, views, accessors, start = values(Gaussians.empty(sh_degree)), [], [], 0
+    for number, column in enumerate(columns.values()):
+        size = count * column.shape[1] * column.itemsize
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": size, "target": 34962})
+        start += size
+        component = _FLOAT if column.dtype == np.float32 else _BYTE
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]
+        accessors.append({"bufferView": number, "componentType": component, "count": count, "type": kind})
+        if component == _BYTE:
+            accessors[-1]["normalized"] = True
     primitive = {
         "mode": 0,
-        "attributes": {column.name: number for number, column in enumerate(columns)},
+        "attributes": {name: number for number, name in enumerate(columns)},
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     return {
@@ -126,14 +115,7 @@ def _document(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
         "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": starts[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": column.stride * count, "target": 34962}
-            for column, start in zip(columns, starts, strict=False)
-        ],
-        "accessors": [
-            {"bufferView": number, "componentType": column.component, "count": count, "type": column.kind}
-            | ({"normalized": True} if column.component == _BYTE else {})
-            for number, column in enumerate(columns)
-        ],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
     }
