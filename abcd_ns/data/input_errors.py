@@ -15,10 +15,8 @@ FEW = 3  # files with the same fault that are named; of more, others than the fi
 
 def one_line(text: str) -> str:
     """`text` fit for a terminal: control characters and undecodable bytes of file names are escaped."""
-    printable = "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
-    )
-    return printable.encode("utf-8", "backslashreplace").decode()
+    escaped = (c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    return "".join(escaped)
 
 
 def say(text: str, style: str | None = None) -> None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -27,7 +26,6 @@ READERS = 4  # threads that decode what is expected
 FEWEST_AHEAD = 12  # photos that are read ahead beyond the budget: those of a step and of the next
 _MASK_USED = 255
 _LOSSY = ("JPEG", "MPO", "WEBP")
-_Key = tuple[Literal["image", "mask"], int]  # what is read, and of which source
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,9 @@ class PhotoSource:
     def size(self) -> tuple[int, int]:
         """(width, height) of the final photo."""
         return self.undistortion.pinhole.size if self.undistortion else self.reduced
+
+
+_Key = tuple[Callable[[PhotoSource], Tensor], int]  # what reads a photo or mask, and the source's index
 
 
 def default_budget() -> int:
@@ -81,24 +82,24 @@ class Photos:
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
         """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it."""
-        return self._get(("image", index))
+        return self._get((_read_photo, index))
 
     def expect(self, indices: Iterable[int]) -> None:
         """Begin to decode the first of these photos and their masks, if they are not kept, for the next
         requests: as many as take an eighth of the budget, and a few in any case."""
         for index in islice(indices, self._ahead):
-            self._expect(("image", index))
+            self._expect((_read_photo, index))
             if self.sources[index].mask_path:
-                self._expect(("mask", index))
+                self._expect((_read_mask, index))
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
         """Which pixels count, or None where the photo has no mask. Do not write to it. A reduced or
         undistorted pixel counts only if all pixels that it is made of count."""
-        return self._get(("mask", index)) if self.sources[index].mask_path else None
+        return self._get((_read_mask, index)) if self.sources[index].mask_path else None
 
     def _read(self, key: _Key) -> Tensor:
-        kind, index = key
-        return (_read_photo if kind == "image" else _read_mask)(self.sources[index])
+        read, index = key
+        return read(self.sources[index])
 
     def _expect(self, key: _Key) -> None:
         """Read it on another thread, for the next `_get`."""

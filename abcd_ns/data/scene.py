@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from abcd_ns.data import OPTION
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.picture_files import by_loose_name, meant_by
 
 MAX_SIDE = 100_000  # pixels along one side beyond which a width or height is taken for a broken file
@@ -165,16 +165,9 @@ def split_lists(
     `found` is what each list names, `known` the name of each frame by what lists call it, or nearly, as files
     are found by FileFinder; `label` gives what messages call the list of a split.
     """
-    try:
-        return _one_split(found, known, label) if found else None
-    except InputError as error:
-        return SplitLists(frozenset(), frozenset(), error)
-
-
-def _one_split(
-    found: Mapping[str, Sequence[str]], known: Mapping[str, str], label: Callable[[str], str]
-) -> SplitLists:
-    problems, everything, fix = Problems(), frozenset(known.values()), f"set {OPTION}eval-mode interval"
+    if not found:
+        return None
+    faults, everything, fix = [], frozenset(known.values()), f"set {OPTION}eval-mode interval"
     loose = by_loose_name(known.items())
     called = {name: known.get(name) or meant_by(name, loose) for names in found.values() for name in names}
     for split, names in found.items():
@@ -182,17 +175,18 @@ def _one_split(
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
-            problems.append(f"{label(split)} names {photos} without a pose ({few}); correct it, or {fix}.")
-    problems.raise_if_any()
-    listed = {split: frozenset(called[name] for name in names) for split, names in found.items()}
-    held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
-    train = listed.get("train", everything - held_out)
-    if listed.keys() == {"train"}:
-        held_out = everything - train
-    if not (train and held_out):
+            faults.append(f"{label(split)} names {photos} without a pose ({few}); correct it, or {fix}.")
+    if not faults:
+        listed = {split: frozenset(called[name] for name in names) for split, names in found.items()}
+        held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
+        train = listed.get("train", everything - held_out)
+        if listed.keys() == {"train"}:
+            held_out = everything - train
+        if train and held_out:
+            return SplitLists(train, held_out)
         side = "hold out" if train else "train on"
-        raise InputError(f"{label(next(iter(found)))} leaves nothing to {side}; {fix}.")
-    return SplitLists(train, held_out)
+        faults = [f"{label(next(iter(found)))} leaves nothing to {side}; {fix}."]
+    return SplitLists(frozenset(), frozenset(), InputError(*faults))
 
 
 def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
