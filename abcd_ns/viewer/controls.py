@@ -18,7 +18,7 @@ class Controls:
     else a finished scene is shown."""
 
     def __init__(self, gui: viser.GuiApi, order: float, changed: Callable[[], None], trains: bool) -> None:
-        self._gui, self._trains = gui, trains
+        self._trains = trains
         self._texts: dict[str, viser.GuiMarkdownHandle] = {}
         with gui.add_folder("Blocks (ABCD)", order=order):
             if trains:

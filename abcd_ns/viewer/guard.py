@@ -23,7 +23,7 @@ from collections import ChainMap
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from http import HTTPStatus
 from importlib.metadata import version
 from typing import Any
@@ -198,16 +198,15 @@ def install() -> None:
 
 def rules_of(server: Any) -> Rules | None:
     """The rules of a `viser.ViserServer`, which then know its GUI elements; None if it is unguarded."""
+
+    def element(name: str) -> Any:
+        guis = (server.gui, *(client.gui for client in server.get_clients().values()))
+        return ChainMap(*(gui._gui_input_handle_from_id for gui in guis)).get(name)
+
     rules = _rules.get(server.get_port())
     if rules is not None:
-        rules.element = partial(_element, server)
+        rules.element = element
     return rules
-
-
-def _element(server: Any, name: str) -> Any:
-    """The input element of the server's or of a client's GUI by its id; None if there is none."""
-    guis = (server.gui, *(client.gui for client in server.get_clients().values()))
-    return ChainMap(*(gui._gui_input_handle_from_id for gui in guis)).get(name)
 
 
 def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:

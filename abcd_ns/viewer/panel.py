@@ -227,13 +227,12 @@ class AbcdPanel(ViewerControl):
             name = f"Training photo {view.index + 1}"
             self._controls.write(photo=f"{photo_image(self._photo(view.index).numpy(), name)}  \n{name}")
 
-    def _chosen_block(self) -> int | None:
-        if self._controls.block is not None or self._coordinator is None:
-            return self._controls.block
-        return next(iter(self._active()), None)
-
     def _show_cameras(self) -> None:
-        block = self._chosen_block() if self._controls.cameras.value else None
+        block = self._controls.block
+        if block is None and self._coordinator is not None:
+            block = next(iter(self._active()), None)
+        if not self._controls.cameras.value:
+            block = None
         if block != self._cameras_of or block is None:
             self._scenery.show_cameras([] if block is None else self._views_of(block))
         self._cameras_of = block
