@@ -20,7 +20,6 @@ from abcd_ns.cluster.assignment import (
     Assignment,
     Finished,
     Lost,
-    Report,
     StepsSeen,
     VisitOutcome,
     VisitTask,
@@ -203,19 +202,16 @@ class Dispatcher(Coordinator):
     def _listen(self) -> None:
         """Hear of workers, SECONDS at most."""
         for report in self.workers.wait(SECONDS):
-            self._hear(report)
-
-    def _hear(self, report: Report) -> None:
-        visit = next((v for v in self._in_flight if v.assignment.number == report.assignment), None)
-        if visit is None or visit.outcome is not None:  # its assignment was given up
-            return
-        match report:
-            case StepsSeen(_, done, psnr):
-                self.announce(StepTaken(self.state.step, visit.active.number, done, psnr))
-            case Finished(_, outcome):
-                visit.outcome = outcome
-            case Lost(_, why):
-                self._lose(visit, why)
+            visit = next((v for v in self._in_flight if v.assignment.number == report.assignment), None)
+            if visit is None or visit.outcome is not None:  # its assignment was given up
+                continue
+            match report:
+                case StepsSeen(_, done, psnr):
+                    self.announce(StepTaken(self.state.step, visit.active.number, done, psnr))
+                case Finished(_, outcome):
+                    visit.outcome = outcome
+                case Lost(_, why):
+                    self._lose(visit, why)
 
     def _lose(self, visit: InFlight, why: str) -> None:
         visit.losses += 1

@@ -111,19 +111,15 @@ class OnAssignment(Visits):
         return config.room((config.density.limit or 0) - left, gaussians, limit)
 
 
+@dataclass(frozen=True)
 class VisitWorker:
     """Trains visits on what `target` gives for a sample; `read_ahead` hears of photos wanted soon."""
 
-    def __init__(
-        self,
-        setup: RunSetup,
-        rasterizer: Rasterizer,
-        target: Callable[[Sample], Target],
-        device: torch.device | str = "cpu",
-        read_ahead: Callable[[Event], None] = lambda _: None,
-    ) -> None:
-        self._setup, self._rasterizer = setup, rasterizer
-        self._target, self._device, self._read_ahead = target, torch.device(device), read_ahead
+    setup: RunSetup
+    rasterizer: Rasterizer
+    target: Callable[[Sample], Target]
+    device: torch.device | str = "cpu"
+    read_ahead: Callable[[Event], None] = lambda _: None
 
     def visit(
         self,
@@ -138,10 +134,10 @@ class VisitWorker:
         scene = AssignedScene(task, state, drawn)
         run = self._run_of(task, scene)
         run.announce.subscribe(listen)
-        run.announce.subscribe(self._read_ahead)
+        run.announce.subscribe(self.read_ahead)
         run.stopwatch = Stopwatch(task.seconds, clock)
         run.stopwatch.start()
-        pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
+        pictures, layers = self.setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnAssignment(run, task, len(state)), layers)
         training.attach(run.active)
         shared = SharedResidual(run, training, scene.as_drawn, task.beside, pictures)
@@ -152,15 +148,13 @@ class VisitWorker:
         return VisitOutcome(result, active.done, shown, health, active.layer_seconds)
 
     def _run_of(self, task: VisitTask, scene: AssignedScene) -> TrainingRun:
-        setup, block, device = self._setup, task.active.geometry.block, self._device
+        setup, block, device = self.setup, task.active.geometry.block, torch.device(self.device)
         params = {n: Parameter(v) for n, v in Gaussians.empty(setup.config.sh_degree, device).items()}
         adams = {n: Adam([params[n]], fused=True, **options) for n, options in setup.optimizers.items()}
         # Two workers may show one photo: whose transform should stay?
         light = None if setup.config.light == "none" else HeldLight(task.light, device)
-        rasterizer, views = self._rasterizer, setup.views
-        run = TrainingRun(
-            setup.config, setup.budget, scene, views, rasterizer, params, adams, device=device, light=light
-        )
+        drawn = scene, setup.views, self.rasterizer, params, adams
+        run = TrainingRun(setup.config, setup.budget, *drawn, device=device, light=light)
         run.state = RunState(
             step=task.step,
             sh_degree=task.active.sh_degree,
@@ -177,7 +171,7 @@ class VisitWorker:
         def assess(part: Batch, rendered: Rendered) -> Judgement:
             rows = []
             for sample, picture in zip(part.samples, rendered.pictures, strict=True):
-                photo, counts = self._target(sample)
+                photo, counts = self.target(sample)
                 found = picture, photo, shared.target(sample, photo)
                 rows.append(found if counts is None else [each * counts.to(picture.device) for each in found])
             pictures, photos, wanted = map(list, zip(*rows, strict=True))

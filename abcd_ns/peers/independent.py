@@ -50,6 +50,8 @@ OWN, CLEAR = 1, 2
 """What a pixel is to a block, by where its surface lies. In the enlarged cell: the block explains the photo.
 Behind it, or the ray misses the cell: the block must let all light through. Any other is 0: the cell lies
 behind the surface, and nothing tells what is there."""
+Region = tuple[Crop, UInt8[Tensor, "_h _w"]]
+"""The part of a view that shows a block, and what its pixels are to the block."""
 
 
 def independent_blocks(tree: BlockTree, start: Gaussians | PointCloud) -> Iterator[tuple[BlockName, Packed]]:
@@ -103,10 +105,8 @@ class BlocksAlone(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._scene = run, run.scene
         self._depths: dict[int, Float[Tensor, "_h _w"]] = {}
-        self._regions: dict[int, UInt8[Tensor, "h w"]] = {}
-        self._crops: dict[int, Crop] = {}
+        self._looked_at: tuple[int, dict[int, Region]] = -1, {}
         self._part = 1.0
-        self._looked_at: int | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
         """The next block's one visit; the block is persisted with what lies around it."""
@@ -117,14 +117,14 @@ class BlocksAlone(Visits):
         plans = state.queue
         share = plans[0].steps / sum(plan.steps for plan in plans)
         block = plans.pop(0).block
-        self._look(block)
+        crops = {view: crop for view, (crop, _) in self._regions(block).items()}
         state.active = ActiveVisit(
             number=state.visit,
             kind=VisitKind.ISOLATED,
-            geometry=VisitGeometry(block, self._crops),
+            geometry=VisitGeometry(block, crops),
             sh_degree=0,
             steps=UNLIMITED,
-            views=tuple(sorted(self._crops)),
+            views=tuple(sorted(crops)),
             began=began,
             since=since,
             until=since + (1 - since) * share if plans else 1.0,
@@ -136,7 +136,7 @@ class BlocksAlone(Visits):
     def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:
         """Others see the block as it will be merged."""
         block = active.geometry.block
-        self._look(block)
+        self._regions(block)  # found now, not in the first step
         begun = sum(self._scene.rows(initial_of(b)) for b in self._blocks)
         self._part = len(self._joined(block)) / begun
         cell = self._scene.tree.cell(block)
@@ -158,10 +158,10 @@ class BlocksAlone(Visits):
         self, batch: Batch, pictures: Sequence[Tensor], photos: Sequence[Tensor]
     ) -> tuple[list[Tensor], list[Tensor]]:
         """The pixels that say something about the block; the background where it must stay clear."""
-        shown, wanted = [], []
+        shown, wanted, regions = [], [], self._regions(self._run.active.geometry.block)
         for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
-            index = sample.view.index
-            region = self._regions[index][sample.crop.within(self._crops[index]).slices][..., None]
+            crop, region = regions[sample.view.index]
+            region = region[sample.crop.within(crop).slices][..., None]
             counts, clear = (region > 0).to(picture), (region == CLEAR).to(photo.device)
             target = torch.where(clear, sample.background.to(photo), photo)
             shown.append(picture * counts)
@@ -176,26 +176,26 @@ class BlocksAlone(Visits):
         """One visit to every block that owns a pixel, weighed by the views that say something about it."""
         state = self._run.state
         for block in self._blocks:
-            self._look(block)
-            owns = any(OWN in region for region in self._regions.values())
-            state.views[block] = len(self._regions) if owns else 0
+            regions = self._regions(block)
+            owns = any(OWN in region for _, region in regions.values())
+            state.views[block] = len(regions) if owns else 0
         state.queue = list(plan_epoch(0, state.views, 1, None, self._run.config.seed))
         if not state.queue:
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
 
-    def _look(self, block: int) -> None:
-        """Find out what pixels are to the block, and let go of the last block's."""
-        if self._looked_at == block:
-            return
-        run, self._looked_at = self._run, block
+    def _regions(self, block: int) -> dict[int, Region]:
+        """By view that says something about the block, what its pixels are to it; kept for one block."""
+        if self._looked_at[0] == block:
+            return self._looked_at[1]
+        run, box, found = self._run, self._box(block), {}
+        self._looked_at = block, found  # lets go of the last one's
         self._depths = self._depths or surface_depths(run)
-        box, self._regions, self._crops = self._box(block), {}, {}
         begun = self._joined(block).gaussians.to(run.device)
-        crops = footprints(begun, block, run.views.values(), run.rasterizer).crops
-        for view, crop in crops.items():
-            region = pixel_kinds(self._depths[view], run.views[view], box)[crop.slices].to(run.device)
-            if bool(region.any()):
-                self._regions[view], self._crops[view] = region, crop
+        for view, crop in footprints(begun, block, run.views.values(), run.rasterizer).crops.items():
+            kinds = pixel_kinds(self._depths[view], run.views[view], box)[crop.slices].to(run.device)
+            if bool(kinds.any()):
+                found[view] = crop, kinds
+        return found
 
     def _box(self, block: int) -> Box:
         means = self._scene.stored(initial_of(block)).means

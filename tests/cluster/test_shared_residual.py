@@ -59,8 +59,7 @@ def test_all_blocks_begin_with_the_picture_of_the_whole_scene_and_share_it(make,
     scene, blocks = whole_scene(run), run.scene.tree.num_blocks
     run._assign()
     while run._in_flight[-1].outcome is None:
-        for report in run.workers.wait(0):
-            run._hear(report)
+        run._listen()
     assert {block for block, _ in begun} == set(range(blocks))
     for view in views:
         summed = torch.zeros(view.height, view.width)

@@ -119,8 +119,9 @@ def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_on
     wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
     coordinator.loss(batch, pictures, wanted).backward()
     kinds = torch.zeros(3, dtype=torch.int64)
+    regions = coordinator.visits._regions(coordinator.run.active.geometry.block)
     for sample, picture, photo in zip(batch.samples, pictures, wanted, strict=True):
-        region = coordinator.visits._regions[sample.view.index]
+        _, region = regions[sample.view.index]
         masks = [region == kind for kind in (OWN, CLEAR, 0)]
         kinds += torch.stack([mask.sum() for mask in masks])
         scale = 2 / (3 * sample.view.width * sample.view.height * len(batch.samples))
