@@ -116,7 +116,12 @@ def _vertices(path: Path, fix: str) -> np.ndarray:
             raise ValueError("is not a .ply file")
         order, count, row, alone = _parse_header(head[:end].decode("ascii", "replace"))
         body = np.memmap(path, np.uint8, "r", start) if path.stat().st_size > start else np.empty(0, np.uint8)
-        return (_read_text if order == "=" else _read_binary)(body, count, row, alone)
+        if order == "=":
+            return _read_text(body, count, row)
+        needed = count * row.itemsize
+        if needed > len(body) or (alone and needed != len(body)):
+            raise ValueError(f"claims {count} points, {needed} bytes, but has {len(body)}")
+        return np.frombuffer(body, dtype=row, count=count)
     except ValueError as error:
         raise InputError(f"{path} {error}; {fix}.") from None
 
@@ -141,7 +146,7 @@ def _parse_header(header: str) -> tuple[str, int, np.dtype, bool]:
     return order, count, row, len(elements) == 1
 
 
-def _read_text(body: np.ndarray, count: int, row: np.dtype, _alone: bool) -> np.ndarray:
+def _read_text(body: np.ndarray, count: int, row: np.dtype) -> np.ndarray:
     lines = body.tobytes().splitlines()[:count]
     try:
         table = np.loadtxt(io.BytesIO(b"\n".join(lines)), row, ndmin=1) if lines else np.empty(0, row)
@@ -150,13 +155,6 @@ def _read_text(body: np.ndarray, count: int, row: np.dtype, _alone: bool) -> np.
     if len(table) != count:
         raise ValueError(f"claims {count} points but has {len(table)}")
     return table
-
-
-def _read_binary(body: np.ndarray, count: int, row: np.dtype, alone: bool) -> np.ndarray:
-    needed = count * row.itemsize
-    if needed > len(body) or (alone and needed != len(body)):
-        raise ValueError(f"claims {count} points, {needed} bytes, but has {len(body)}")
-    return np.frombuffer(body, dtype=row, count=count)
 
 
 def _colors(points: np.ndarray) -> np.ndarray | None:
