@@ -77,8 +77,7 @@ def normalizing_similarity(
     rotation = u @ vt
     # With center "none" nerfstudio keeps the origin, so `middle` must not be taken off.
     translation = np.zeros(3) if center == "none" else transform[:, 3] - rotation @ middle
-    centered = Similarity(rotation, translation, 1.0)
-    reach = np.abs(centered.poses(poses)[..., 3]).max()
+    reach = np.abs(Similarity(rotation, translation, 1.0).points(poses[..., 3])).max()
     if auto_scale and reach == 0:
         raise InputError(f"all cameras are at the origin; set {OPTION}auto-scale-poses False.")
     return Similarity(rotation, translation, scale_factor / reach if auto_scale else scale_factor)
