@@ -74,7 +74,7 @@ def as_stored(scene: Scene) -> Scene:
             sizes.append(read_size(finder.find(frame.name)))
         except InputError:
             return scene
-        if sizes[0] == frame.lens.size:
+        if sizes == [frame.lens.size]:  # the first
             return scene
     pairs = list(zip(sizes, (frame.lens.size for frame in scene.frames), strict=True))
     (width, height), (of_width, of_height) = max(pairs, default=((1, 1), (1, 1)))

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.normalize import normalizing_similarity
+from tests.data import dataparser_scenes
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
@@ -210,6 +211,14 @@ def test_photos_that_are_all_one_share_of_their_cameras_are_taken(tmp_path, divi
         assert (cameras.width[row], cameras.height[row]) == (int(width / divide), int(height / divide))
         assert cameras.fx[row].item() == pytest.approx(width * 0.9 * int(width / divide) / width)
     assert "times as large as their cameras" in capsys.readouterr().out
+
+
+def test_a_photo_may_have_the_size_that_another_photos_camera_says(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataparser_scenes, "SIZES", ((40, 30), (80, 60)))
+    write_model(tmp_path / "sparse/0")
+    write_photos(tmp_path / "images", divide=2)
+    cameras = parser(tmp_path, eval_mode="all").get_dataparser_outputs().cameras
+    assert sorted(set(cameras.width.flatten().tolist())) == [20, 40]
 
 
 # Surveys
