@@ -34,8 +34,8 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
         $row few/$scene 5 $scene-12 4 --steps 1500 --methods abcd --blocks 1 8 $two_seeds \
             --vary training.density.min-contribution=16.667
     done
-    $row coverage/land 10 land 1 --steps 4000 --methods abcd-monolithic abcd --blocks 8 --seeds 0 1 2
-    $row coverage/caliterra 13 caliterra 4 --steps 4000 --methods abcd-monolithic abcd --blocks 8 --seeds 0 1 2
+    $row coverage/land 12 land 1 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
+    $row coverage/caliterra 18 caliterra 4 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
     $row gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
         --vary training.density.min-contribution={0,1,4,16,64}
     $row peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
