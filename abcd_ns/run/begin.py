@@ -178,6 +178,8 @@ def _new_store(
         seen = mean_share_seen(capture.views, cloud.means) if capture.points else 1.0
         blocks, fitted = fit.blocks_to_begin_with(allowed, workers, seen), allowed.limits
         say(replace(allowed, blocks=blocks).in_words())
+        if blocks > allowed.blocks and not workers:
+            say(f"A view sees {seen:.0%} of the points: two blocks learn more in as much time than one.")
     if options.partition == "kd":
         tree = build_kd(cloud.means, blocks)
     else:
