@@ -31,7 +31,11 @@ from abcd_ns.run.options import RunOptions
 LOG = logging.getLogger("abcd_ns")
 
 Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]  # 0..255 as integers, or 0..1
-BRIGHTEST = 2.0  # of real numbers that are taken for 0..1; some filters go beyond 1
+RANGES = {
+    True: (-0.5, 2.0),
+    False: (0.0, 255.0),
+}  # of real numbers, as filters go beyond 0..1; and of integers
+MOST_STRETCH = 2e-2  # of R R^T from the identity
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ def train(
     Args:
         views: cameras in one world space. Their `index` and `near` are set here.
         photos: one for each view, of its size. A sequence may read them when they are asked for.
-        points: places in world space, and colours 0..255.
+        points: places in world space, and colours 0..255. These and photos may be NumPy arrays.
         out: folder of the run. Blocks are kept in its `abcd/store` as they are trained.
         steps: optimisation steps for the whole scene.
         options: None for the defaults.
@@ -75,14 +79,14 @@ def train(
     """
     options, folder = options or RunOptions(), Path(out) / STATE / STORE
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    training, (places, colors) = options.training, points
+    training, (places, colors) = options.training, map(torch.as_tensor, points)
     _check(views, photos, steps, options, device, folder)
     _check_points(places, colors)
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
 
     def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
-        pixels = photos[index][crop.slices]
+        pixels = torch.as_tensor(photos[index])[crop.slices]
         return (pixels.float() if pixels.is_floating_point() else pixels.float() / 255).to(device)
 
     def target(sample: Sample) -> Target:
@@ -132,8 +136,32 @@ def render(
 def _check_points(places: Tensor, colors: Tensor) -> None:
     if not 0 < len(places) == len(colors):
         raise UserError(f"There are {len(places)} points and {len(colors)} colours: give one for each.")
+    if places.shape[1:] != (3,) or colors.shape[1:] != (3,):
+        raise UserError(
+            f"Points and colours are {[*places.shape]} and {[*colors.shape]}: both must be [n, 3]."
+        )
+    if colors.is_floating_point() and 0 < float(colors.max()) <= 1:
+        raise UserError("Colours of points are 0..1: multiply them by 255.")
     if not places.isfinite().all(dim=1).any():
         raise UserError("No point is finite: give points in the world space of the views.")
+
+
+def _check_view(label: str, view: View, photo: Tensor) -> None:
+    if tuple(photo.shape) != (view.height, view.width, 3):
+        wanted, shape = [view.height, view.width, 3], list(photo.shape)
+        raise UserError(f"Photo {label} has shape {shape}, but its view has {wanted}.")
+    if photo.dtype != torch.uint8:
+        least, most = map(float, photo.float().aminmax())
+        low, high = RANGES[photo.is_floating_point()]
+        if not low <= least <= most <= high:
+            right = "give integers 0..255, or real numbers 0..1"
+            raise UserError(f"Photo {label} has values from {least:g} to {most:g}: {right}.")
+    turn, side = view.viewmat[:3, :3].double(), max(view.width, view.height)
+    is_rigid = float((turn @ turn.T - torch.eye(3).to(turn)).abs().max()) <= MOST_STRETCH
+    if not (is_rigid and view.viewmat.isfinite().all()):
+        raise UserError(f"View {label} has a viewmat that is no rotation and translation: repair it.")
+    if not all(side / 50 < focal < side * 1000 for focal in view.K.diagonal()[:2].tolist()):
+        raise UserError(f"View {label} has a focal length that no camera has: K must be in pixels.")
 
 
 def _check(
@@ -152,10 +180,6 @@ def _check(
     if len(views) != len(photos) or not views:
         raise UserError(f"There are {len(views)} views and {len(photos)} photos: give a photo for each view.")
     for index, view in enumerate(views):
-        if tuple(photos[index].shape) != (view.height, view.width, 3):
-            wanted, shape = [view.height, view.width, 3], list(photos[index].shape)
-            raise UserError(f"Photo {index} has shape {shape}, but its view has {wanted}.")
-        if photos[index].is_floating_point() and not float(photos[index].max()) <= BRIGHTEST:
-            raise UserError(f"Photo {index} is no picture of 0..1: give integers, or divide by 255.")
+        _check_view(str(index), view, torch.as_tensor(photos[index]))
     if options.cluster is not None or (options.workers > 1 and not can_fork(device)):
         raise UserError("Workers on GPUs or a cluster need ns-train: leave out workers and cluster.")

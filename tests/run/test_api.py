@@ -4,12 +4,13 @@ import dataclasses
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from abcd_ns import RunOptions, TrainingConfig, UserError, train
+from abcd_ns import RunOptions, TrainingConfig, UserError, View, train
 from abcd_ns.cli.export.command import export
 from abcd_ns.engine.events import StepTaken, VisitEnded
 from abcd_ns.nerfstudio.views import views_of
@@ -65,6 +66,13 @@ def test_it_trains_as_ns_train_does(tmp_path):
     )
 
 
+def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
+    return [
+        dataclasses.replace(view, **{name: change(getattr(view, name)) for name, change in fields.items()})
+        for view in ring_of_views(2)
+    ]
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -72,7 +80,16 @@ def test_it_trains_as_ns_train_does(tmp_path):
         ({"photos": [torch.zeros(36, 48, 3), torch.zeros(36, 48, 4)]}, "Photo 1 has shape"),
         ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
         ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
-        ({"photos": [torch.full((36, 48, 3), 200.0)] * 2}, "Photo 0 is no picture of 0..1"),
+        ({"photos": [torch.full((36, 48, 3), 200.0)] * 2}, "Photo 0 has values from 200 to 200: give int"),
+        ({"photos": [torch.full((36, 48, 3), -1.0)] * 2}, "from -1 to -1"),
+        ({"photos": [torch.full((36, 48, 3), torch.nan)] * 2}, "from nan"),
+        ({"photos": [torch.full((36, 48, 3), 9_999, dtype=torch.uint16)] * 2}, "from 9999"),
+        ({"points": (torch.rand(9, 3), torch.rand(9, 3))}, "multiply them by 255"),
+        ({"points": (torch.rand(3, 9), torch.zeros(3, 9))}, re.escape("[3, 9] and [3, 9]")),
+        ({"views": changed(K=lambda K: K * 0)}, "K must be in pixels"),
+        ({"views": changed(K=lambda K: K / 480)}, "K must be in pixels"),
+        ({"views": changed(viewmat=lambda m: m * torch.nan)}, "View 0 has a viewmat"),
+        ({"views": changed(viewmat=lambda m: m * 3)}, "View 0 has a viewmat"),
         ({"points": (torch.full((2, 3), torch.nan), torch.zeros(2, 3))}, "No point is finite"),
         ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
         ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
@@ -84,23 +101,28 @@ def test_it_trains_as_ns_train_does(tmp_path):
 )
 def test_what_does_not_fit_is_refused_before_anything_is_written(tmp_path, change, says):
     given = {
+        "views": ring_of_views(2),
         "photos": [torch.zeros(36, 48, 3)] * 2,
         "points": (torch.rand(9, 3), torch.zeros(9, 3)),
+        "steps": 1,
         **change,
     }
     with pytest.raises(UserError, match=says):
-        train(ring_of_views(2), out=tmp_path / "out", **given)
+        train(out=tmp_path / "out", **given)
     assert not (tmp_path / "out").exists()
 
 
-def test_photos_of_double_precision_train_as_those_of_single(tmp_path):
+def test_photos_of_double_precision_and_arrays_train_as_tensors_of_single(tmp_path):
     """What numpy makes of a photo divided by 255."""
     views, points = ring_of_views(3), (torch.rand(9, 3) - 0.5, torch.zeros(9, 3))
     photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(k)) for k in range(3)]
     single = train(views, photos, points, tmp_path / "single", steps=2)
-    double = train(views, [photo.double() for photo in photos], points, tmp_path / "double", steps=2)
-    for (_, one), (_, other) in zip(single.gaussians.items(), double.gaussians.items(), strict=True):
-        assert torch.equal(one, other)
+    double = [photo.double() for photo in photos]
+    arrays = [photo.numpy() for photo in photos], tuple(part.numpy() for part in points)
+    for number, given in enumerate([(double, points), arrays]):
+        again = train(views, *given, tmp_path / str(number), steps=2)
+        for (_, one), (_, other) in zip(single.gaussians.items(), again.gaussians.items(), strict=True):
+            assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(("sites", "expected"), [(2, {0}), (20, {0, 1})])
