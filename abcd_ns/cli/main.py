@@ -3,6 +3,7 @@
 import difflib
 import errno
 import importlib
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -90,14 +91,22 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
     """
     first, *others = (sys.argv[1:] if args is None else args) or ["--help"]
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        if stream.errors == "strict":  # names of files may have characters that the terminal lacks
+            stream.reconfigure(errors="backslashreplace")
+    code = 0
     try:
         if first in ("--help", "-h"):
             print(HELP.format(commands="\n".join(f"  {each.name:<12}{each.help}" for each in COMMANDS)))
-            return 0
-        if first == "--version":
+        elif first == "--version":
             print(f"abcd {__version__}")
-            return 0
-        return run_command(find_command(first), others)
+        else:
+            code = run_command(find_command(first), others)
+        print(end="", flush=True)
+        return code
+    except BrokenPipeError:  # `abcd ... | head`; at its end Python would flush once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except UserError as error:
         message = str(error)
     except ImportError as error:
@@ -105,11 +114,13 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         message = missing(error)
     except OSError as error:
-        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         if error.filename is None and not is_full:
             raise
-        message = f"{error.filename or 'The output'} cannot be "
-        message += f"written: {error.strerror}; free some space." if is_full else f"used: {error.strerror}."
+        fault = f"used: {error.strerror}."
+        if is_full:
+            fault = f"written: {error.strerror}; make room or write elsewhere."
+        message = f"{error.filename or 'The output'} cannot be {fault}"
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     from rich.console import Console  # `abcd --help` has no use for it

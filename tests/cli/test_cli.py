@@ -1,6 +1,7 @@
 """The `abcd` command: what it prints, what it returns, and what it does not import."""
 
 import errno
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ RAISED = {
     "absent": UserError("absent: no such scene; give an existing folder."),
     "locked": PermissionError(errno.EACCES, "Permission denied", "run/log.jsonl"),
     "full": OSError(errno.ENOSPC, "No space left on device"),
+    "too large": OSError(errno.EFBIG, "File too large"),
     "missing": ModuleNotFoundError("No module named 'no_such_package'"),
     "ctrl-c": KeyboardInterrupt(),
     "bug": ValueError("a bug"),
@@ -91,7 +93,12 @@ def test_arguments_reach_the_function_which_sets_the_exit_code(greet, capsys):
         (
             "full",
             2,
-            "error: The output cannot be written: No space left on device; free some space.\n",
+            "error: The output cannot be written: No space left on device; make room or write elsewhere.\n",
+        ),
+        (
+            "too large",
+            2,
+            "error: The output cannot be written: File too large; make room or write elsewhere.\n",
         ),
         (
             "missing",
@@ -105,6 +112,20 @@ def test_arguments_reach_the_function_which_sets_the_exit_code(greet, capsys):
 def test_what_a_user_can_mend_is_one_line_without_traceback(greet, capsys, name, code, said):
     assert greet("--name", name) == code
     assert capsys.readouterr() == ("", said)
+
+
+def test_a_reader_that_ends_early_is_no_error():
+    """As in `abcd --help | head -1`."""
+    command = subprocess.Popen([sys.executable, "-m", "abcd_ns.cli.main"], stdout=-1, stderr=-1)
+    command.stdout.close()
+    assert (command.stderr.read(), command.wait()) == (b"", 141)
+
+
+def test_names_that_the_terminal_cannot_show_are_escaped(greet, monkeypatch):
+    terminal = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(terminal, encoding="ascii"))
+    assert greet("--name", "\u00fc") == 0
+    assert terminal.getvalue() == b"hello \\xfc\n"
 
 
 @pytest.mark.parametrize("name", ["bug", "import of a name that is gone", "bug of the system's"])
