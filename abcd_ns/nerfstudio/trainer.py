@@ -1,5 +1,6 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -87,6 +88,13 @@ class AbcdTrainerConfig(TrainerConfig):
         if name == "viewer" and "viewer" in self.__dict__:
             value = on_this_machine(value, sys.argv)
         super().__setattr__(name, value)
+
+    def set_experiment_name(self) -> None:
+        """As nerfstudio's, which gives no name to `.`, and leaves the output folder by that of `..`."""
+        data = self.pipeline.datamanager.data
+        if self.experiment_name is None and data is not None:
+            self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem or None
+        super().set_experiment_name()
 
     def get_base_dir(self) -> Path:
         """As nerfstudio's; of a run that a command opens, where its config.yml is by now."""

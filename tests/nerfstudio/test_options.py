@@ -244,6 +244,17 @@ def test_our_reader_may_be_named_and_serves_other_methods():
     assert parser == AbcdDataParserConfig(eval_mode="all", as_stored=True)
 
 
+@pytest.mark.parametrize("given", [".", "..", "../a.room", "transforms.json"])
+def test_a_run_is_named_by_its_folder_however_that_is_given(given, tmp_path, monkeypatch):
+    folder = tmp_path / "a.room"
+    (folder / "images").mkdir(parents=True)
+    (folder / "transforms.json").touch()
+    monkeypatch.chdir(folder / "images" if given == ".." else folder)
+    config = copy.deepcopy(methods.abcd.config)
+    config.pipeline.datamanager.data, config.timestamp = Path(given), "now"
+    assert config.get_base_dir() == Path("outputs/a/abcd/now")
+
+
 def test_options_of_an_earlier_version_are_loaded_with_the_recipe_of_today():
     text = "!!python/object:abcd_ns.engine.train.config.TrainingConfig\nlayers: false\nwarmup: 0.5\n"
     loaded = yaml.load(text, Loader=yaml.Loader)
