@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path, PureWindowsPath
 from typing import Literal, TypeVar
 
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, PngImagePlugin, UnidentifiedImageError
 
 from abcd_ns.data.input_errors import InputError
 
@@ -26,6 +26,7 @@ _HIDDEN = (".", "@eaDir", "__MACOSX")  # how names begin that no program lists a
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read, by content and not by name. Pillow knows more, some of which it gives to other programs."""
 Image.MAX_IMAGE_PIXELS = 500_000_000  # Pillow's own limit is 89 million: aerial cameras have up to 450
+PngImagePlugin.MAX_TEXT_CHUNK = 64 << 20  # Pillow's own limit is 1 MiB: editors write longer histories
 _MODES = frozenset({"RGB", "RGBA", "L", "LA", "P", "1"})
 _ENDS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
 _PNG_BIT_DEPTH_BYTE = 24

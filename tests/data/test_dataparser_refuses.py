@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from abcd_ns.data.input_errors import SHOWN, InputError, Problems
 from abcd_ns.data.picture_files import read_size
@@ -245,6 +246,14 @@ def test_photos_of_aerial_cameras_are_not_too_large(tmp_path):
     """150 megapixels, over what Pillow takes for an attack."""
     (tmp_path / "photo.png").write_bytes(png_that_claims((14_204, 10_652)))
     assert read_size(tmp_path / "photo.png") == (14_204, 10_652)
+
+
+def test_photos_with_long_texts_are_read(scene):
+    """Pillow refuses more than a mebibyte, for fear of an attack."""
+    path, text = scene / "images" / NAMES[0], PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", "x" * 2_000_000, zip=True)
+    Image.open(path).save(path, pnginfo=text)
+    assert len(parser(scene, eval_mode="all").get_dataparser_outputs().image_filenames) == len(NAMES)
 
 
 def test_long_lists_are_cut_with_a_count():
