@@ -14,6 +14,9 @@ from abcd_ns.data.picture_files import by_loose_name, meant_by
 
 MAX_SIDE = 100_000  # pixels along one side beyond which a width or height is taken for a broken file
 MAX_COORDINATE = 1e12  # world units beyond which a camera's place is taken for a broken file
+CORNER = 0.05
+"""Share of width and height. Where all principal points are closer to the corner, they are in other units or
+counted from the middle. That of a photo's tile may lie there, but not those of all tiles."""
 SPLITS = ("train", "val", "test")
 _NAMED = 3  # unknown photos that a message names; the others are counted
 
@@ -151,6 +154,11 @@ def check_layout(scene: Scene) -> None:
     twice = [name for name, count in counts.items() if count > 1]
     if twice:
         raise InputError(*(f"{scene.model} names the photo {n} twice; keep one pose of it." for n in twice))
+    shares = [(frame.lens.cx / frame.lens.width, frame.lens.cy / frame.lens.height) for frame in scene.frames]
+    if np.abs(shares).max() < CORNER:
+        where = f"({scene.frames[0].lens.cx:g}, {scene.frames[0].lens.cy:g}), the upper left corner"
+        fix = "give pixels from that corner, usually half the width and height"
+        raise InputError(f"{scene.model} has all principal points near {where}; {fix}.")
     centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
     if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():
         raise InputError(f"{scene.model} has all cameras at one place; add photos from other places.")

@@ -256,6 +256,13 @@ def test_photos_with_long_texts_are_read(scene):
     assert len(parser(scene, eval_mode="all").get_dataparser_outputs().image_filenames) == len(NAMES)
 
 
+def test_a_tile_of_a_photo_may_have_its_principal_point_in_the_corner(scene):
+    meta = write_transforms(scene)
+    meta["frames"][0].update(cx=0, cy=0)
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    assert len(parser(scene, eval_mode="all").get_dataparser_outputs().image_filenames) == len(NAMES)
+
+
 def test_long_lists_are_cut_with_a_count():
     problems = Problems()
     for i in range(SHOWN + 2):
@@ -307,6 +314,13 @@ def _spoil_pose(row: int, column: int, value: float) -> Callable[[dict], None]:
         (_spoil("fl_x", None), "fl_x must be a number, not null"),
         (_spoil("fl_x", -500), "focal length"),
         (_spoil("w", 0), "size"),
+        *(
+            (
+                lambda meta, at=at: [frame.update(cx=at, cy=-at) for frame in meta["frames"]],
+                "upper left corner",
+            )
+            for at in (0, 0.5, -1.5)
+        ),
         (_spoil("k4", 0.1), "k4"),
         (_spoil("k1", -40.0), "leaves no picture"),
         (_spoil("file_path", "../../etc/passwd"), "leads out"),
