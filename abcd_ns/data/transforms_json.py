@@ -170,7 +170,9 @@ def _lens(values: dict[str, Any], label: str, photo: Path) -> Lens:
     if unread:
         fix = "undistort the photos, or remove it to train as if it were 0"
         raise InputError(f"{label} has {unread} = {values[unread]}, which is not read; {fix}.")
-    fisheye = model in _FISHEYES or bool(values.get("is_fisheye", False))
+    if (flag := values.get("is_fisheye")) not in (None, False, True):
+        raise InputError(f"{label}: is_fisheye must be true or false, not {json.dumps(flag)}.")
+    fisheye = model in _FISHEYES or bool(flag)
     if "w" in values and "h" in values:
         width, height = (int(_number(values, key, label)) for key in ("w", "h"))
     else:

@@ -314,6 +314,7 @@ def _spoil_pose(row: int, column: int, value: float) -> Callable[[dict], None]:
         (_spoil("fl_x", None), "fl_x must be a number, not null"),
         (_spoil("fl_x", -500), "focal length"),
         (_spoil("w", 0), "size"),
+        (_spoil("is_fisheye", "false"), "must be true or false"),
         *(
             (
                 lambda meta, at=at: [frame.update(cx=at, cy=-at) for frame in meta["frames"]],
