@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from scipy.spatial import cKDTree
@@ -51,6 +52,13 @@ class Inspected:
     def made_for(self, training: TrainingConfig) -> MadeFor:
         """What a run on this, with such options, is made for."""
         return MadeFor.of(self.capture.image_filenames, views_of(self.capture.cameras), training)
+
+    def check_seen(self) -> None:
+        """Refuse points of which no view to train on shows one."""
+        points, views = torch.from_numpy(self.cloud), views_of(self.capture.cameras)
+        if len(points) and not any(bool(view.depths_of(points)[1].any()) for view in views):
+            fix = "take both from one model (ply_file_path must be in the coordinates of the frames)"
+            raise InputError(f"None of the {len(points):,} points lies in a photo to train on; {fix}.")
 
     def in_words(self) -> str:
         """One line for the terminal."""

@@ -151,6 +151,8 @@ class AbcdTrainerConfig(TrainerConfig):
             if start:  # before its config.yml is replaced
                 with ParameterStore.open(start.store, start.pin, read_only=True) as store:
                     found.made_for(pipeline.training).check(store)
+            elif not (model.random_init or model.init_splats):
+                found.check_seen()
             splats = 0 if start else splats_to_begin_with(model, pipeline.training, found)
             if pipeline.blocks == 0:
                 points = splats or (0 if model.random_init else found.points) or model.num_random

@@ -1,6 +1,7 @@
 """Faults rarer than a missing photo: each is one line, found before training, and all at once."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,17 @@ def test_points_at_absurd_places_are_left_out(tmp_path, capsys):
 
 def test_path_that_the_system_refuses_is_one_line(tmp_path):
     assert "cannot be read (File name too long)" in refusal(tmp_path / ("x" * 300))
+
+
+def test_points_that_no_photo_shows_are_refused_in_one_line(scene):
+    """Those of another model, or in other coordinates than the frames."""
+    write_transforms(scene)
+    inspect(parser(scene).config).check_seen()
+    path = scene / "points.ply"
+    head, _, rows = path.read_text().partition("end_header\n")
+    path.write_text(head + "end_header\n" + re.sub(r"(?m)^\S+", "1e4", rows))
+    with pytest.raises(InputError, match="None of the 20 points lies in a photo"):
+        inspect(parser(scene).config).check_seen()
 
 
 # Masks

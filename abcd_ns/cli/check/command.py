@@ -220,7 +220,7 @@ def _of_points(s: Survey) -> Iterator[Finding]:
         fix = "See whether the reconstruction is complete; more features and more matches give more points."
         yield warning("few-points", what, fix)
     if s.seen.in_none > UNSEEN * count:
-        yield warning(
+        yield (error if s.seen.in_none == count else warning)(
             "unseen-points",
             f"{s.seen.in_none / count:.0%} of the points lie in no picture, {s.seen.behind_all / count:.0%} "
             "behind every camera. No photo can correct Gaussians that begin there.",

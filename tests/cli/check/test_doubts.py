@@ -116,6 +116,7 @@ def test_points_that_are_doubtful(found):
     behind = found.centers.mean(axis=0) + 1000 * backwards + found.points
     foreign = changed(found, points=behind)
     assert the("unseen-points", foreign).what.startswith("100% of the points")
+    assert the("unseen-points", foreign).level == "error"
     assert "views-with-few-points" not in names(foreign)
     what = the("unseen-points", changed(found, points=np.concatenate([found.points, behind[:150]]))).what
     assert what.startswith("20% of the points")
