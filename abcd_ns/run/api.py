@@ -31,10 +31,7 @@ from abcd_ns.run.options import RunOptions
 LOG = logging.getLogger("abcd_ns")
 
 Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]  # 0..255 as integers, or 0..1
-RANGES = {
-    True: (-0.5, 2.0),
-    False: (0.0, 255.0),
-}  # of real numbers, as filters go beyond 0..1; and of integers
+REAL, INTEGER = (-0.5, 2.0), (0.0, 255.0)  # values of photos; filters go beyond 0..1
 MOST_STRETCH = 2e-2  # of R R^T from the identity
 
 
@@ -152,7 +149,7 @@ def _check_view(label: str, view: View, photo: Tensor) -> None:
         raise UserError(f"Photo {label} has shape {shape}, but its view has {wanted}.")
     if photo.dtype != torch.uint8:
         least, most = map(float, photo.float().aminmax())
-        low, high = RANGES[photo.is_floating_point()]
+        low, high = REAL if photo.is_floating_point() else INTEGER
         if not low <= least <= most <= high:
             right = "give integers 0..255, or real numbers 0..1"
             raise UserError(f"Photo {label} has values from {least:g} to {most:g}: {right}.")
