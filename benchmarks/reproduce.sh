@@ -57,11 +57,12 @@ with_12_photos() { # of those that are not held out, evenly spaced
 }
 
 take() {
-    local name=$1 data=$DATA/$3 reduction=$4 wanted
+    local name=$1 data=$DATA/$3 reduction=$4 pictures=0 wanted
+    [[ ! -f docs/results/$name.jpg ]] || pictures=1
     for wanted in $asked; do
         [[ $wanted == all || $name == "$wanted" || $name == "$wanted"/* ]] || continue
         [[ $3 != *-12 ]] || data=$(with_12_photos "$3")
-        abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures 0 --out "$out/$name"
+        abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures $pictures --out "$out/$name"
     done
 }
 
@@ -70,6 +71,8 @@ collect() {
     [[ ! -f $found/results.json ]] || install -D -m 644 "$found/results.json" "docs/results/$1.json"
     [[ ! -f $found/memory_accuracy.png || ! -f docs/results/$1.png ]] ||
         install -m 644 "$found/memory_accuracy.png" "docs/results/$1.png"
+    [[ ! -d $found/pictures || ! -f docs/results/$1.jpg ]] || python -c 'import sys; from PIL import Image
+Image.open(sys.argv[1]).save(sys.argv[2], quality=90)' "$found"/pictures/view-*.png "docs/results/$1.jpg"
 }
 
 if (($# == 0)); then

@@ -53,7 +53,7 @@ def within_budgets(plan: Plan, ceilings: Results, methods: Sequence[str], shares
 def draw_budgets(results: Results, out: Path) -> list[Path]:
     """Write PSNR and SSIM over peak memory as png into `out`; nothing where no arm has a budget."""
     arms = [arm for arm in results.arms if all(run.gaussian_bytes for run in arm.runs)]
-    if not any(_is_budgeted(arm) for arm in arms):
+    if not any(is_budgeted(arm) for arm in arms):
         return []
     figure = Figure(figsize=(7.2, 3.6), layout="constrained")
     for axes, (field, title) in zip(figure.subplots(1, 2), QUALITY.items(), strict=True):
@@ -72,20 +72,21 @@ def draw_budgets(results: Results, out: Path) -> list[Path]:
 def _draw_method(axes: Axes, method: str, arms: Sequence[Arm], field: str) -> None:
     """A line through its budgets, bars from the lowest seed to the highest; dotted what no limit gives."""
     look = {"color": COLORS[method], "marker": MARKERS[method]}
-    if within := [arm for arm in arms if _is_budgeted(arm)]:
+    if within := [arm for arm in arms if is_budgeted(arm)]:
         means = [arm.mean(field) for arm in within]
         ends = [[getattr(run, field) for run in arm.runs] for arm in within]
         bars = [[mean - min(e), max(e) - mean] for mean, e in zip(means, ends, strict=True)]
         x = list(map(_mebibytes, within))
         axes.errorbar(x, means, list(zip(*bars, strict=True)), label=f"{method} within a budget", **look)
     for arm in arms:
-        if not _is_budgeted(arm):
+        if not is_budgeted(arm):
             axes.axhline(arm.mean(field), color=look["color"], linewidth=0.8, linestyle=":")
             label = f"{method} without a limit"
             axes.plot([_mebibytes(arm)], [arm.mean(field)], linestyle="", label=label, **look)
 
 
-def _is_budgeted(arm: Arm) -> bool:
+def is_budgeted(arm: Arm) -> bool:
+    """Whether its runs keep to a budget."""
     return arm.variant.startswith(OPTION)
 
 

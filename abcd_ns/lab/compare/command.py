@@ -15,7 +15,15 @@ from rich.console import Console
 from abcd_ns.arguments import Flag, check_numbers, check_ranges, words
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.budgets import ALONE, JOINT, WITHIN, draw_budgets, shares_of, within_budgets
+from abcd_ns.lab.compare.budgets import (
+    ALONE,
+    JOINT,
+    WITHIN,
+    draw_budgets,
+    is_budgeted,
+    shares_of,
+    within_budgets,
+)
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import (
@@ -268,14 +276,21 @@ def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     return 1 if results.failures else 0
 
 
-def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
-    """A run of each method's first arm, of one seed where they share any, and the folder of its pictures."""
-    arms = [results.of(method)[0] for method in results.methods]
+def shown(results: Results, plan: Plan) -> list[tuple[str, Run, Path]]:
+    """Of each method the first arm without a budget and the one within the smallest: its label, a run, of one
+    seed where they share any, and the folder of its pictures."""
+    arms = []
+    for method in results.methods:
+        own = results.of(method)
+        arms += [arm for arm in own if not is_budgeted(arm)][:1] + [*filter(is_budgeted, own)][-1:]
     seeds = [{run.seed for run in arm.runs} for arm in arms]
     shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]
     folders = {(job.method, job.variant, job.seed): job.folder(plan.out) for job in plan.jobs}
     runs = [(arm, next(run for run in arm.runs if not shared or run.seed == shared[0])) for arm in arms]
-    return [(run, folders[arm.method, arm.variant, run.seed] / PICTURES) for arm, run in runs]
+    return [
+        (results.labels[arm.name], run, folders[arm.method, arm.variant, run.seed] / PICTURES)
+        for arm, run in runs
+    ]
 
 
 def _settings(given: Options) -> Settings:

@@ -42,7 +42,7 @@ def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], titl
         psnr = decibels(np.mean((picture.astype(np.float64) - photo) ** 2) / 255**2)
         _show(grid[0, column], picture, f"{name}  {psnr:.2f} dB")
         map_of_errors = error_map(picture, photo)
-        below = f"error of {name}, mean {map_of_errors.mean():.1%}"
+        below = f"mean error {map_of_errors.mean():.1%}"
         error = _show(grid[1, column], map_of_errors, below, cmap=ERROR_COLORS, vmin=0, vmax=1 / ERROR_GAIN)
     grid[1, 0].axis("off")
     inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
@@ -59,19 +59,19 @@ def _show(axes: Axes, picture: NDArray, title: str, **look: object) -> AxesImage
     return axes.imshow(picture, interpolation="nearest", **look)
 
 
-def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
-    """One figure for each held-out view that the runs, one a method, left pictures of in their folders;
-    returns the paths."""
+def draw_pictures(runs: Sequence[tuple[str, Run, Path]], out: Path) -> list[Path]:
+    """One figure for each held-out view that the runs left pictures of in their folders; returns the paths.
+    Each run has a label before it."""
     if not runs:
         return []
-    first, folder = runs[0]
+    _, first, folder = runs[0]
     shutil.rmtree(out, ignore_errors=True)  # of an earlier comparison, with other views
     out.mkdir()
     paths = []
-    seeds = ", ".join(map(str, sorted({run.seed for run, _ in runs})))
+    seeds = ", ".join(map(str, sorted({run.seed for _, run, _ in runs})))
     for found in sorted(folder.glob("photo-*.png")):
         row = int(found.stem.removeprefix("photo-"))
-        pictures = {run.method: _read(path / f"merged-{row:04d}.png") for run, path in runs}
+        pictures = {label: _read(path / f"merged-{row:04d}.png") for label, _, path in runs}
         name = next(view.name for view in first.views if view.row == row)
         paths.append(out / f"view-{row:04d}.png")
         title = f"{first.scene}, held-out view {name}, merged, seed {seeds}"

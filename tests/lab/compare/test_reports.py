@@ -14,7 +14,7 @@ from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
 from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
-from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
+from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run, made_up_settings
 
 # The charts
 
@@ -140,7 +140,7 @@ def test_every_view_that_all_runs_drew_gets_a_figure_of_photo_and_pictures(tmp_p
     views = tuple(ViewScore(row, f"{row:04d}.jpg", 1.0, None, None, 1.0, None) for row in (0, 5))
     colours = {("abcd-monolithic", "photo"): (10, 200, 30), ("abcd-monolithic", "merged"): (200, 30, 40)}
     colours |= {("abcd", "photo"): (10, 200, 30), ("abcd", "merged"): (200, 30, 41)}
-    runs = [(made_up_run(m, views=views), tmp_path / m) for m in ("abcd-monolithic", "abcd")]
+    runs = [(m, made_up_run(m, views=views), tmp_path / m) for m in ("abcd-monolithic", "abcd")]
     for (method, kind), colour in colours.items():
         (tmp_path / method).mkdir(exist_ok=True)
         for row in (0, 5):
@@ -158,7 +158,21 @@ def test_where_a_seed_failed_pictures_are_of_one_that_all_methods_have_and_title
     results = made_up_results(*runs, seeds=(0, 1))
     jobs = tuple(Job(run.method, run.seed, results.settings) for run in runs)
     plan = Plan("comparison", results.settings, Path("out"), jobs, "abcd")
-    found = [(run.method, run.seed, folder) for run, folder in shown(results, plan)]
+    found = [(label, run.seed, folder) for label, run, folder in shown(results, plan)]
     assert found == [(m, 1, Path(f"out/runs/{m}/seed-1/pictures")) for m in ("abcd", "abcd-monolithic")]
     assert results.means_of == "mean of 1 to 2 seeds"
     assert made_up_results(made_up_run()).means_of == ""
+
+
+def test_within_budgets_pictures_are_of_the_smallest_beside_what_no_limit_gives():
+    asked = {"abcd-monolithic": [(), ("gaussian_bytes=4194304",), ("gaussian_bytes=2097152",)]}
+    asked["abcd"] = asked["abcd-monolithic"][1:]
+    jobs = tuple(Job(m, 0, made_up_settings(), changes) for m, arms in asked.items() for changes in arms)
+    results = made_up("comparison", *(made_up_arm(j.variant, None, {0: 24.0}, j.method) for j in jobs))
+    found = shown(results, Plan("comparison", results.settings, Path("out"), jobs, "abcd"))
+    assert [label for label, _, _ in found] == [
+        "abcd-monolithic",
+        "abcd-monolithic, 2.0 KiB",
+        "abcd, 2.0 KiB",
+    ]
+    assert len({folder for _, _, folder in found}) == 3
