@@ -172,7 +172,7 @@ def test_within_budgets_pictures_are_of_the_smallest_beside_what_no_limit_gives(
     found = shown(results, Plan("comparison", results.settings, Path("out"), jobs, "abcd"))
     assert [label for label, _, _ in found] == [
         "abcd-monolithic",
-        "abcd-monolithic, 2.0 KiB",
-        "abcd, 2.0 KiB",
+        "abcd-monolithic, 2 MiB",
+        "abcd, 2 MiB",
     ]
     assert len({folder for _, _, folder in found}) == 3
