@@ -7,6 +7,7 @@ import shlex
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -109,9 +110,11 @@ def test_links_lead_to_files_and_headings(path):
 
 
 def final_psnr(value: Any) -> Iterator[float]:
-    """Held-out PSNR of every run in a JSON value, at its end."""
+    """Held-out PSNR of every run in a JSON value, at its end, and the mean of every arm's."""
     if isinstance(value, dict) and isinstance(value.get("psnr_merged"), float):
         yield value["psnr_merged"]
+    if isinstance(value, dict) and "variant" in value and "runs" in value:
+        yield fmean(scores) if all(scores := [run["psnr_merged"] for run in value["runs"]]) else 0.0
     for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         yield from final_psnr(each)
 
