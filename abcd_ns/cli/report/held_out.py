@@ -73,10 +73,13 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int) -> HeldOut:
 
 
 def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
-    """Rows of `wanted` views, spread evenly from the best PSNR to the worst, each with its rank in words."""
+    """Rows of `wanted` views, spread evenly from the best PSNR to the worst, each with its rank in words.
+    Unless there are two, the one in the middle is the median, by which the page opens."""
     ranked, last = sorted(scores, key=lambda view: -view.psnr_merged), len(scores) - 1
     wanted = min(wanted, len(ranked))
-    ranks = [last // 2] if wanted == 1 else np.linspace(0, last, wanted).round().astype(int).tolist()
+    ranks = np.linspace(0, last, wanted).round().astype(int).tolist()
+    if wanted not in (0, 2):
+        ranks[(wanted - 1) // 2] = last // 2
     words = {last // 2: "median", last: "worst", 0: "best"} if last else {0: "the only one"}
     return {ranked[rank].row: words.get(rank, f"{rank + 1} of {last + 1}") for rank in ranks}
 

@@ -181,6 +181,15 @@ def test_shown_views_reach_from_the_best_to_the_worst():
     assert pick(scores, 0) == pick([], 3) == {}
 
 
+@pytest.mark.parametrize("views", range(3, 14))
+def test_the_view_that_a_page_opens_with_is_the_median(views):
+    scores = [made_up_score(row, 20.0 - row) for row in range(views)]
+    for wanted in (1, *range(3, views + 1)):
+        words = list(pick(scores, wanted).values())
+        assert len(words) == wanted
+        assert words[(wanted - 1) // 2] == "median"
+
+
 def test_changed_settings_and_the_command_that_sets_them():
     options = made_up_settings().options
     changed = {"pipeline.blocks": 4, "pipeline.max_seconds": 60.0, "timestamp": "now", "output_dir": "x"}
