@@ -3,11 +3,13 @@
 import io
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from abcd_ns.engine.events import HeldOutScored, Pruning, Repaired, StepTaken, VisitBegan
+from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.train.run_state import BlockHealth, Stopwatch
 from abcd_ns.nerfstudio.run import progress
 from abcd_ns.nerfstudio.run.progress import ProgressReport
@@ -63,6 +65,17 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 2: seen by no view, left as it was",
         "  block 3: seen by 1 view only",
         "  3 oversized Gaussians shrunk",
+    ]
+
+
+def test_a_run_that_stops_within_a_visit_says_which(coordinator, capsys):
+    coordinator.state.health = {0: BlockHealth(visits=1), 2: BlockHealth()}
+    coordinator.state.active = SimpleNamespace(geometry=VisitGeometry(2, {}))
+    ProgressReport(coordinator).close()
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "  block 1: trained",
+        "  block 2: not visited yet",
+        "  block 3: in training when stopped",
     ]
 
 

@@ -3,7 +3,7 @@
 import math
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import psutil
 import torch
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from abcd_ns.data.input_errors import say
 from abcd_ns.engine import events
-from abcd_ns.engine.train.run_state import UNLIMITED, HealthByBlock, standing
+from abcd_ns.engine.train.run_state import UNLIMITED, RunState, standing
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words
@@ -98,7 +98,7 @@ class ProgressReport:
         visits = "1 visit" if state.visit == 1 else f"{state.visit} visits"
         seconds = clock(self._coordinator.stopwatch.seconds)
         say(f"Trained {steps} in {visits}, {seconds}: {self._summary()}.")
-        lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
+        lines = summary(self._coordinator.scene.tree.num_blocks, state)
         wanted, degree = self._coordinator.config.sh_degree, state.sh_degree
         if self._coordinator.config.limits.late_harmonics and degree < wanted:
             lines.append(f"harmonics up to degree {degree} of {wanted}: others had no room, or no time")
@@ -190,11 +190,13 @@ def _at_work(workers: Sequence[events.WorkerSeen]) -> str:
     return f"{len(busy)} of {len(workers)} workers busy{which}"
 
 
-def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int]) -> list[str]:
+def summary(blocks: int, state: RunState) -> list[str]:
     """Lines for the end of a run: how the blocks stand, and what had to be repaired. Blocks count from 1."""
     by_standing: dict[str, list[int]] = {}
+    active = None if state.active is None else state.active.geometry.block
     for block in range(blocks):
-        by_standing.setdefault(standing(block, health_by_block.get(block), views), []).append(block + 1)
+        words = standing(block, state.health.get(block), state.views)
+        by_standing.setdefault("in training when stopped" if block == active else words, []).append(block + 1)
     if list(by_standing) == ["trained"]:
         lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
     else:
@@ -202,7 +204,7 @@ def summary(blocks: int, health_by_block: HealthByBlock, views: Mapping[int, int
         for words, members in by_standing.items():
             shown = ", ".join(map(str, members[:12])) + (", ..." if len(members) > 12 else "")
             lines.append(f"{'block' if len(members) == 1 else 'blocks'} {shown}: {words}")
-    records = health_by_block.values()
+    records = state.health.values()
     totals = {name: sum(getattr(record, name) for record in records) for name in REPAIRED}
     found = [f"{total:,} {REPAIRED[name]}" for name, total in totals.items() if total]
     return [*lines, ", ".join(found)] if found else lines
