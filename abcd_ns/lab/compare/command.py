@@ -70,7 +70,7 @@ class Options:
     blocks: Annotated[tuple[int, ...] | None, words("N ...")] = None
     """Blocks of every method that has any; an arm for each of several numbers. Default: 8."""
     vary: Annotated[tuple[str, ...] | None, words("NAME=VALUE ...")] = None
-    """An arm for each change of an option. Names: `ns-train abcd --help`, under --pipeline.
+    """An arm for each change of an option. Names: docs/reference.md, under --pipeline.
     Several at once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
     tiles: Annotated[tuple[int, ...] | None, words("N ...")] = None
     """An arm for each size of a synthetic terrain, which takes the place of data: a block for each tile."""
