@@ -28,7 +28,8 @@ _BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 class AbcdDataset(InputDataset):
     """The photos that a dataparser, ours or any of nerfstudio's, found: at the size of their cameras and
-    without distortion. See `Photos` and `with_photos`; `scale_factor` is 1."""
+    without distortion. See `Photos` and `with_photos`; `scale_factor` is 1. With `on_black` transparent
+    photos are put on black as float32: ns-render dataset shows four channels in false colours."""
 
     def __init__(
         self,
@@ -36,23 +37,22 @@ class AbcdDataset(InputDataset):
         scale_factor: float = 1.0,
         budget_bytes: int | None = None,
         needs_photos: bool = True,
+        on_black: bool = False,
     ):
         outputs = with_photos(dataparser_outputs, needs_photos)
         super().__init__(outputs, scale_factor)
-        self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)
+        self.photos, self._on_black = Photos(outputs.metadata[PHOTOS], budget_bytes), on_black
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """uint8 [H, W, 3 or 4], shared with later callers: do not write to it."""
         return self.photos.image(image_idx).numpy()
 
-    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
-        """On black where it is transparent: ns-render dataset shows four channels in false colours."""
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w c"]:
         image = super().get_image_float32(image_idx)
-        return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
+        return image[..., :3] * image[..., 3:] if self._on_black and image.shape[-1] == 4 else image
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """`image_idx`, `image` of the type asked for, [H, W, 3] or, as uint8, also [H, W, 4], and, if any,
-        `mask` bool [H, W, 1]."""
+        """`image_idx`, `image` of the type asked for, [H, W, 3 or 4], and, if any, `mask` bool [H, W, 1]."""
         read = {"uint8": self.get_image_uint8, "float32": self.get_image_float32}[image_type]
         mask = self.photos.mask(image_idx)
         data = {"image_idx": image_idx, "image": read(image_idx)}

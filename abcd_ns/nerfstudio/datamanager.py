@@ -157,8 +157,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self._dataset(self.train_dataparser_outputs, budget)
 
     def _dataset(self, outputs: DataparserOutputs, budget: int | None) -> AbcdDataset:
-        # Viewing and exporting need no photos.
-        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self.test_mode != "inference")
+        needs_photos = self.test_mode != "inference"  # viewing and exporting need none
+        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=needs_photos, on_black=True)
 
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; none is kept in RAM."""

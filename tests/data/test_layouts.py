@@ -49,10 +49,12 @@ def write_blender(folder: Path, splits: tuple[str, ...] = ("train", "val", "test
 
 def test_transparent_photos_are_colours_on_black_to_ns_render_and_the_viewer(tmp_path):
     """ns-render dataset draws pictures of more than three channels by their principal components."""
-    dataset = AbcdDataset(parser(write_blender(tmp_path)).get_dataparser_outputs())
-    stored, shown = dataset.get_data(0, "uint8")["image"].float() / 255, dataset[0]["image"]
+    outputs = parser(write_blender(tmp_path)).get_dataparser_outputs()
+    usual, shown = (AbcdDataset(outputs, on_black=on_black) for on_black in (False, True))
+    stored = shown.get_data(0, "uint8")["image"].float() / 255
     assert stored.shape == (24, 32, 4)
-    assert torch.equal(shown, stored[..., :3] * stored[..., 3:])
+    assert torch.equal(usual[0]["image"], stored)
+    assert torch.equal(shown[0]["image"], stored[..., :3] * stored[..., 3:])
 
 
 @pytest.mark.parametrize("called", ["{stem}.png", "{name}.png", "{name}"])
