@@ -30,7 +30,7 @@ WORDS = {
     "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
     "rasterize_mode": ("classic", "antialiased"),
 }
-LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-7
+LEAST_COLOR, LEAST_SCALE, LEAST_OPACITY = 0.01, 1e-30, 1e-7
 """Gaussians are kept before activation, which maps 0 to infinity."""
 
 
@@ -67,7 +67,7 @@ def rasterization(
         means, scales: centres and standard deviations, world units.
         quats: rotations (w, x, y, z); need not be normalised.
         opacities: 0..1.
-        colors: 0 or more; with `sh_degree` the coefficients of spherical harmonics, k of 1, 4, 9 or 16.
+        colors: any numbers; with `sh_degree` the coefficients of spherical harmonics, k of 1, 4, 9 or 16.
         viewmats, Ks: world to camera, OpenCV convention; intrinsics in pixels.
         near_plane: Gaussians whose mean has a smaller camera z are not drawn; world units.
         sh_degree: in use; at most what k allows.
@@ -85,18 +85,18 @@ def rasterization(
         TypeError: gsplat has no such argument.
     """
     _check(colors, sh_degree, fixed, render_mode=render_mode, rasterize_mode=rasterize_mode)
-    gaussians = _before_activation(means, quats, scales, opacities, colors)
+    _check_cameras(viewmats, Ks, backgrounds)
+    gaussians, lift = _before_activation(means, quats, scales, opacities, colors)
     cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
     views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
     options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
     rasters = _draw(gaussians, views, **options, **({"absgrad": True} if absgrad else {}))
-    color = torch.stack([raster.color for raster in rasters])
     alphas = torch.stack([1 - raster.transmittance[..., None] for raster in rasters])
+    color = torch.stack([raster.color for raster in rasters]) - lift * alphas
     if backgrounds is not None:
         color = color + (1 - alphas) * backgrounds[:, None, None]
     depth = torch.stack([raster.depth[..., None] for raster in rasters])
-    if "ED" in render_mode:
-        depth = depth / alphas.clamp_min(1e-10)
+    depth = depth / alphas.clamp_min(1e-10) if "ED" in render_mode else depth
     wanted = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode)
     sizes = {"width": width, "height": height, "n_cameras": len(views), "gaussian_ids": None}
     return torch.cat(wanted, dim=-1), alphas, rasters[0].info | sizes
@@ -123,11 +123,22 @@ def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any], **words
         raise ValueError(f"colors must be {wanted}, not {list(colors.shape)}.")
 
 
+def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
+    wanted = {"viewmats": (viewmats, 4, 4), "Ks": (Ks, 3, 3)}
+    wanted |= {} if backgrounds is None else {"backgrounds": (backgrounds, backgrounds.shape[-1])}
+    for name, (value, *size) in wanted.items():
+        if list(value.shape) != [len(viewmats), *size]:
+            raise ValueError(f"{name} must be {[len(viewmats), *size]}, not {list(value.shape)}.")
+
+
 def _before_activation(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
-) -> Gaussians:
-    """Raise ValueError unless there is one of each for each Gaussian, in one dtype and on one device: the
-    native library reads memory by the means' number and type."""
+) -> tuple[Gaussians, float]:
+    """The Gaussians, and what was added to their colours.
+
+    Raise ValueError unless there is one of each for each Gaussian, in one dtype and on one device: the native
+    library reads memory by the means' number and type.
+    """
     shapes = {"means": (means, 3), "quats": (quats, 4), "scales": (scales, 3), "opacities": (opacities,)}
     for name, (value, *size) in {**shapes, "colors": (colors, *colors.shape[1:])}.items():
         if list(value.shape) != [len(means), *size]:
@@ -135,9 +146,11 @@ def _before_activation(
         if (value.dtype, value.device) != (means.dtype, means.device) or not value.is_floating_point():
             kind = f"{name} are {value.dtype} on {value.device}, and means {means.dtype} on {means.device}"
             raise ValueError(f"{kind}: give all as one floating-point type, on one device.")
-    if colors.ndim == 2:
-        colors = ((colors - 0.5) / SH_C0)[:, None]
-    return Gaussians(
+    lift = 0.0
+    if colors.ndim == 2:  # harmonics below 0 are drawn as 0 and have no gradient
+        lift = max(0.0, LEAST_COLOR - float(colors.detach().min())) if len(colors) else 0.0
+        colors = ((colors + lift - 0.5) / SH_C0)[:, None]
+    made = Gaussians(
         means=means,
         scales=_between(scales, LEAST_SCALE, torch.inf).log(),
         quats=quats,
@@ -145,6 +158,7 @@ def _before_activation(
         features_rest=colors[:, 1:],
         opacities=_between(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY).logit()[:, None],
     )
+    return made, lift
 
 
 def _between(values: Tensor, least: float, most: float) -> Tensor:

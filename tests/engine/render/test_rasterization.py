@@ -105,6 +105,23 @@ def test_what_is_exactly_opaque_or_flat_has_gradients():
     assert flat.grad.isfinite().all()
 
 
+def test_colors_of_any_sign_are_drawn_and_have_gradients():
+    """Normals are drawn as colours, and black must be able to learn."""
+    given, view = random_gaussians(12), VIEWS[0]
+    others = (given.means, given.quats, given.scales.exp(), given.opacities[:, 0].sigmoid())
+    camera = (view.viewmat[None], view.K[None], view.width, view.height)
+    colors = torch.linspace(-1, 1, 36, dtype=torch.float64).reshape(12, 3).requires_grad_()
+    pictures, alphas, _ = rasterization(*others, colors, *camera)
+    lighter, _, _ = rasterization(*others, colors.detach() + 2, *camera)
+    torch.testing.assert_close(pictures, lighter - 2 * alphas)
+    pictures.sum().backward()
+    assert pictures.min() < 0
+    assert relative_error(colors.grad, colors.grad[:, :1].expand(-1, 3)) < 1e-9
+    black = torch.zeros(12, 3, dtype=torch.float64, requires_grad=True)
+    rasterization(*others, black, *camera)[0].sum().backward()
+    torch.testing.assert_close(black.grad, colors.grad)
+
+
 def test_every_argument_of_gsplats_is_taken_or_refused():
     theirs = inspect.signature(gsplat.rasterization).parameters
     own = {name for name, p in inspect.signature(rasterization).parameters.items() if p.kind != p.VAR_KEYWORD}
@@ -136,9 +153,10 @@ from abcd_ns import rasterization
 
 def says(**change):
     given = {"means": torch.ones(3, 3), "quats": torch.ones(3, 4), "scales": torch.ones(3, 3)}
-    given |= {"opacities": torch.ones(3), "colors": torch.ones(3, 3), **change}
+    given |= {"opacities": torch.ones(3), "colors": torch.ones(3, 3)}
+    given |= {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 8, "height": 8}
     try:
-        rasterization(**given, viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=8, height=8)
+        rasterization(**given | change)
     except ValueError as error:
         return str(error)
 
@@ -148,6 +166,9 @@ assert "opacities must be [3], not [2]" in says(opacities=torch.ones(2))
 assert "colors must be [3, 3], not [2, 3]" in says(colors=torch.ones(2, 3))
 assert "scales are torch.float64 on cpu" in says(scales=torch.ones(3, 3).double())
 assert "colors are torch.float16 on cpu" in says(colors=torch.ones(3, 3).half())
+assert "viewmats must be [4, 4, 4], not [4, 4]" in says(viewmats=torch.eye(4))
+assert "Ks must be [1, 3, 3], not [3, 3]" in says(Ks=torch.eye(3))
+assert "backgrounds must be [1, 3], not [3]" in says(backgrounds=torch.ones(3))
 assert "render_mode must be one of RGB, D" in says(render_mode="depth")
 assert "rasterize_mode must be one of classic, antialiased, not aa" in says(rasterize_mode="aa")
 """
