@@ -3,9 +3,11 @@
 torch is imported on use: `abcd doctor` must say what is wrong where it does not start.
 """
 
+import ctypes
 import os
 import platform
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -15,6 +17,8 @@ from pathlib import Path
 import psutil
 
 import abcd_ns
+
+PR_SET_PDEATHSIG = 1  # of Linux' prctl
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,12 @@ class Versions:
     abcd_ns: str
     commit: str | None
     """Of the abcd_ns checkout, with "+changes" where files differ from it; None outside a checkout."""
+
+
+def end_with_parent() -> None:
+    """On Linux, have this process killed when its parent ends, however that ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def usable_cores() -> int:

@@ -37,11 +37,11 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
+from abcd_ns.machine import end_with_parent
 
 SILENCE = 600.0  # seconds without a word after which a worker counts as lost
 FIRST_WORD = 5.0  # seconds in which a process that was just forked says that it lives
 TELL_EVERY = 0.5  # seconds between two words of a worker's progress
-PR_SET_PDEATHSIG = 1  # of Linux' prctl: a signal for this process when its parent ends, however that ends
 
 
 def can_fork(device: torch.device) -> bool:
@@ -185,7 +185,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> 
             pipe.send((event.visit_step, event.psnr) if isinstance(event, StepTaken) else None)
 
     try:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        end_with_parent()
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the training process decides
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -18,6 +18,7 @@ def do_here(command: list[str], stdout, **_) -> nullcontext:
         try:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("sys.argv", [module, job])
+                patch.setattr(runner, "end_with_parent", lambda: None)
                 runpy.run_module(module, run_name="__main__")
         except SystemExit as end:
             code = end.code or 0

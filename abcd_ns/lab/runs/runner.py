@@ -24,7 +24,14 @@ from abcd_ns.lab.job import Job, Plan, Settings, TerrainJob
 from abcd_ns.lab.results.records import RecordError, decode, read_json, write_json
 from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, Failure, LeftOut, Results, Run
 from abcd_ns.lab.results.tables import TABLE_FILE, findings_of, write_table
-from abcd_ns.machine import Machine, describe_machine, describe_versions, peak_device_bytes, peak_rss_bytes
+from abcd_ns.machine import (
+    Machine,
+    describe_machine,
+    describe_versions,
+    end_with_parent,
+    peak_device_bytes,
+    peak_rss_bytes,
+)
 from abcd_ns.terminal import print_plain
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
@@ -216,6 +223,7 @@ def _short(outcome: Run | Failure) -> str:
 def work(kind: type[Job], do: Callable[..., Run]) -> int:
     """In a job's process, whose only argument is the job's file: `do` it, given job and folder; returns 0, or
     2 for an error of the user's."""
+    end_with_parent()
     (path,) = map(Path, sys.argv[1:])
     job = decode(kind, read_json(path), str(path))
     try:

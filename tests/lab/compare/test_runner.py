@@ -5,8 +5,11 @@ The worker here is a script that makes runs up; test_real.py trains.
 
 import dataclasses
 import json
+import subprocess
+import sys
 from io import StringIO
 
+import psutil
 import pytest
 from rich.console import Console
 
@@ -59,6 +62,26 @@ def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
     assert [outcome.method for outcome in run(plan)] == ["abcd-monolithic", "abcd"]
     assert worker.calls() == ["abcd"]
     assert not (half / "leftover").exists()
+
+
+JOB = """
+import os, time
+from abcd_ns.lab.job import Job
+from abcd_ns.lab.runs.runner import work
+work(Job, lambda *_: (print(os.getpid(), flush=True), time.sleep(60)))
+"""
+PARENT = "import subprocess, sys; subprocess.run([sys.executable, *sys.argv[1:]])"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux")
+def test_a_job_ends_with_a_comparison_that_is_killed(plan, tmp_path):
+    job = tmp_path / "job.json"
+    job.write_text(json.dumps(dataclasses.asdict(plan.jobs[0])))
+    command = [sys.executable, "-c", PARENT, "-c", JOB, str(job)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as parent:
+        child = psutil.Process(int(parent.stdout.readline()))
+        parent.terminate()
+        child.wait(10)
 
 
 @pytest.mark.parametrize(
