@@ -24,7 +24,9 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
+from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.run import SETTINGS_FILE, STATE, STORE
+from abcd_ns.run.store import MADE_FOR, MadeFor
 
 CHECKPOINTS = "nerfstudio_models"
 _DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)
@@ -59,6 +61,8 @@ class RunFolder:
     """None where the run ended before its first."""
     state: RunState = field(default_factory=RunState)
     """Of the planner at the checkpoint, or else the last that was saved."""
+    photos: str | None = None
+    """Of MadeFor; None where that is not known."""
 
 
 def open_run(path: Path) -> RunFolder:
@@ -68,15 +72,19 @@ def open_run(path: Path) -> RunFolder:
     checkpoint = _newest(path / CHECKPOINTS)
     if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
         story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
-    return RunFolder(path, settings, story, checkpoint, _read_state(path / STATE / STORE, checkpoint))
+    return RunFolder(path, settings, story, checkpoint, *_read_state(path / STATE / STORE, checkpoint))
 
 
 def load_pipeline(run: RunFolder, data: Path) -> AbcdPipeline:
     """The trained model of the checkpoint with its data, for drawing. A UserError where `pipeline_config`
-    raises one, the data is gone, or the checkpoint does not fit this version."""
+    raises one, the data is gone or another run's, or the checkpoint does not fit this version."""
     config, checkpoint = pipeline_config(run.path, data), run.checkpoint
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline = config.setup(device=device, test_mode="test").eval()
+    trained_on = pipeline.datamanager.train_dataset
+    here = MadeFor.of(trained_on.image_filenames, views_of(trained_on.cameras), config.training)
+    if run.photos not in (None, here.photos):
+        raise UserError(f"The photos of {data} are not those that {run.path} was trained on; give its own.")
     try:
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
@@ -138,13 +146,13 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(one_line(why)) from None
 
 
-def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState:
+def _read_state(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState, str | None]:
     if not folder.is_dir():
-        return RunState()
+        return RunState(), None
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
-        return RunState.from_json(store.state)
+        return RunState.from_json(store.state), store.header.get(MADE_FOR, {}).get("photos")
     except StoreError as error:
         raise UserError(one_line(str(error))) from None

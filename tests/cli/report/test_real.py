@@ -119,6 +119,16 @@ def test_where_the_photos_are_gone_the_page_says_so_and_has_the_rest(copied, cap
     assert "/absent/wall" in capsys.readouterr().out.replace("\n", "")
 
 
+def test_other_photos_than_the_runs_are_not_scored(copied, tmp_path, capsys):
+    others = write_scene(tmp_path / "other")
+    (others / "test_list.txt").write_text("01.png")
+    assert report(copied, data=others) == 0
+    assert "are not those that" in capsys.readouterr().out.replace("\n", " ")
+    page = (copied / "report.html").read_text()
+    assert "Held-out views could not be drawn" in page
+    assert "<input" not in page
+
+
 def test_photos_are_those_of_a_folder_that_the_user_names(trained, copied, tmp_path, capsys):
     """Not of one that the run names: it may come from elsewhere, and the page may be handed on."""
     photos = photos_of(trained)
