@@ -72,7 +72,7 @@ collect() {
     [[ ! -f $found/memory_accuracy.png || ! -f docs/results/$1.png ]] ||
         install -m 644 "$found/memory_accuracy.png" "docs/results/$1.png"
     [[ ! -d $found/pictures || ! -f docs/results/$1.jpg ]] || python -c 'import sys; from PIL import Image
-Image.open(sys.argv[1]).save(sys.argv[2], quality=90)' "$found"/pictures/view-*.png "docs/results/$1.jpg"
+Image.open(sys.argv[1]).convert("RGB").save(sys.argv[2], quality=90)' "$found"/pictures/view-*.png "docs/results/$1.jpg"
 }
 
 if (($# == 0)); then
