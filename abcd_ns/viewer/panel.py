@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import psutil
 import torch
 import viser
@@ -56,6 +57,7 @@ class AbcdPanel(ViewerControl):
         self._laid_out = 0  # blocks that have boxes and entries in the list
         self._bounds: Box | None = None
         self._training_views: list[View] = []
+        self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: Viewer) -> None:
@@ -111,11 +113,13 @@ class AbcdPanel(ViewerControl):
 
     def _lay_out(self) -> None:
         """Make boxes and the list of blocks anew, as the tree is cut now."""
-        tree, scene, self._training_views = self._model.tree, self._model.scene(), self._views()
+        tree, scene = self._model.tree, self._model.scene()
         if self._bounds is None:  # once: every block is read for it, and one may be on the device
             means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]
             self._bounds = bulk(torch.cat(means))
         self._scenery.set_boxes(boxes_of(tree, self._bounds))
+        self._training_views = self._views()
+        self._first_look = first_look(self._bounds, self._training_views)
         self._controls.set_blocks(tree.num_blocks)
         self._laid_out = tree.num_blocks
 
@@ -195,8 +199,8 @@ class AbcdPanel(ViewerControl):
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Place a new browser's camera so that it sees the scene."""
-        if self._bounds is not None:
-            client.camera.position, client.camera.look_at = first_look(self._bounds, self._training_views)
+        if self._first_look is not None:
+            client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
 
     # -- what the user chooses
