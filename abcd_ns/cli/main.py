@@ -66,23 +66,20 @@ examples:
   abcd report --help            the options of one command"""
 
 
-def find_command(name: str) -> Command:
-    """The command called `name`; a UserError that offers the nearest name where there is none."""
+def run_command(name: str, args: list[str]) -> int:
+    """Run a command on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2), and a
+    name that no command has a UserError that offers the nearest."""
     by_name = {command.name: command for command in COMMANDS}
-    if name in by_name:
-        return by_name[name]
-    close = difflib.get_close_matches(name, by_name, n=1)
-    hint = f"did you mean 'abcd {close[0]}'?" if close else f"there are: {', '.join(by_name)}."
-    raise UserError(f"abcd has no command {name!r}; {hint}")
-
-
-def run_command(command: Command, args: list[str]) -> int:
-    """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
-    if command.passes_on:
-        return command.load()(args)
+    if name not in by_name:
+        close = difflib.get_close_matches(name, by_name, n=1)
+        hint = f"did you mean 'abcd {close[0]}'?" if close else f"there are: {', '.join(by_name)}."
+        raise UserError(f"abcd has no command {name!r}; {hint}")
+    function = by_name[name].load()
+    if by_name[name].passes_on:
+        return function(args)
     import tyro  # `abcd --help` has no use for it
 
-    return tyro.cli(command.load(), prog=f"abcd {command.name}", args=args) or 0
+    return tyro.cli(function, prog=f"abcd {name}", args=args) or 0
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -101,7 +98,7 @@ def main(args: Sequence[str] | None = None) -> int:
         elif first == "--version":
             print(f"abcd {__version__}")
         else:
-            code = run_command(find_command(first), others)
+            code = run_command(first, others)
         print(end="", flush=True)
         return code
     except BrokenPipeError:  # `abcd ... | head`; at its end Python would flush once more

@@ -23,7 +23,6 @@ from abcd_ns.data.scene import Lens, distorted_lens
 from abcd_ns.data.undistort import undistortion
 
 PHOTOS = "photos"  # the entry of the metadata that holds one PhotoSource for each camera
-_BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 
 class AbcdDataset(InputDataset):
@@ -120,12 +119,12 @@ def pinhole_cameras(lenses: Sequence[Lens], poses: Float[Tensor, "n 3 4"]) -> Ca
 
 
 def _lens(cameras: Cameras, row: int, label: str) -> Lens:
-    kind = int(cameras.camera_type[row])
-    if kind not in (_BROWN, _FISHEYE):
-        name = CameraType(kind).name.lower()
-        raise InputError(f"{label} is {name}; photos must be perspective or fisheye ones.")
+    kind = CameraType(int(cameras.camera_type[row]))
+    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
+        raise InputError(f"{label} is {kind.name.lower()}; photos must be perspective or fisheye ones.")
     given = cameras.distortion_params
     coefficients = [0.0] * 6 if given is None else given[row].double().tolist()
     fx, fy, cx, cy = (float(getattr(cameras, name)[row]) for name in ("fx", "fy", "cx", "cy"))
     size = int(cameras.width[row]), int(cameras.height[row])
-    return distorted_lens(Lens(*size, fx, fy, cx, cy, fisheye=kind == _FISHEYE), coefficients, label)
+    plain = Lens(*size, fx, fy, cx, cy, fisheye=kind is CameraType.FISHEYE)
+    return distorted_lens(plain, coefficients, label)

@@ -23,7 +23,7 @@ from abcd_ns.data.ply import GREY
 from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
 from abcd_ns.data.undistort import undistortion
-from abcd_ns.progress_bar import ProgressBar
+from abcd_ns.progress_bar import tracked
 
 MAX_AUTO_SIDE = 1600  # pixels along a photo's longer side: nerfstudio's MAX_AUTO_RESOLUTION
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
@@ -205,10 +205,9 @@ def check_masks(sources: list[PhotoSource]) -> None:
             photos.mask(row)
         return found
 
-    with ThreadPoolExecutor() as pool, ProgressBar("Looking at masks", len(masked)) as bar:
-        for lines in pool.map(look, range(len(masked))):
+    with ThreadPoolExecutor() as pool:
+        for lines in tracked(pool.map(look, range(len(masked))), "Looking at masks", len(masked)):
             problems.extend(lines)
-            bar.advance()
     problems.raise_if_any()
 
 

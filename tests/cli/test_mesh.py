@@ -26,7 +26,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.run_state import RunState
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.settings import flat_options, write_settings
 from abcd_ns.run.store import MadeFor
@@ -59,15 +59,19 @@ def sphere(count: int = 20_000) -> Gaussians:
     return surface_of(torch.stack((across * angle.cos(), across * angle.sin(), z), dim=1), 0.015, colors)
 
 
-@pytest.fixture(scope="module", params=["expected", "median"])
-def maps(request, tmp_path_factory) -> DepthMaps:
-    """The sphere from around it, drawn from two blocks, one after the other."""
-    scene, views = sphere(), ring_of_views(8, width=96, height=72)
+def depth_maps(folder: Path, scene: Gaussians, views: list[View], median: bool = False) -> DepthMaps:
+    """Drawn from two blocks, one after the other."""
     parted = MemoryScene(build_kd(scene.means, 2), scene)
     renderer = LayerRenderer(parted, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
     assert len(renderer.nodes()) == 2
-    median = request.param == "median"
-    return DepthMaps(tmp_path_factory.mktemp("maps"), renderer, RenderSettings(sh_degree=3), views, median)
+    return DepthMaps(folder, renderer, RenderSettings(sh_degree=3), views, median)
+
+
+@pytest.fixture(scope="module", params=["expected", "median"])
+def maps(request, tmp_path_factory) -> DepthMaps:
+    """The sphere from around it."""
+    views = ring_of_views(8, width=96, height=72)
+    return depth_maps(tmp_path_factory.mktemp("maps"), sphere(), views, request.param == "median")
 
 
 def fused(maps: DepthMaps, part_boxes: int) -> tuple[list[int], Piece]:
@@ -117,20 +121,16 @@ def test_parts_make_the_same_surface_bit_for_bit_and_a_part_at_a_time_is_in_ram(
 @pytest.mark.parametrize("maps", ["expected"], indirect=True)
 def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
     assert list(Fusion(maps, VOXEL / 100).pieces()) == []
-    scene, views = sphere(), maps.views[:2]
+    scene = sphere()
     scene.opacities[:] = -5.0
-    whole = MemoryScene(build_kd(scene.means, 1), scene)
-    renderer = LayerRenderer(whole, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
-    assert not len(DepthMaps(tmp_path, renderer, RenderSettings(sh_degree=3), views).footprints())
+    assert not len(depth_maps(tmp_path, scene, maps.views[:2]).footprints())
 
 
 def test_specks_are_left_out():
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    grid = [
-        Piece(corners + np.array([k, 0, 0], np.float32), corners, np.array([[0, 1, 2]])) for k in range(2000)
-    ]
-    speck = Piece(corners + np.float32(5000), corners, np.array([[0, 1, 2]]))
-    assert len(without_specks(weld([*grid, speck])).faces) == 2000
+    corners, face = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.array([[0, 1, 2]])
+    strip = [Piece(corners + np.array([k, 0, 0], np.float32), corners, face) for k in range(2000)]
+    speck = Piece(corners + np.float32(5000), corners, face)
+    assert len(without_specks(weld([*strip, speck])).faces) == 2000
 
 
 # -- the command -------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """`abcd poses`: photos alone become a data set, and what cannot is said."""
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -81,70 +80,70 @@ def test_cameras_are_where_they_were(places, found):
         poses.poses(found)
 
 
-def write_blank(data: Path, count: int) -> None:
-    (data / "images").mkdir()
-    for number in range(count):
-        Image.new("RGB", (64, 48), (number, 90, 120)).save(data / "images" / f"{number}.png")
-
-
-def test_photos_that_show_nothing_are_refused_and_nothing_is_left(tmp_path):
-    write_blank(tmp_path, 4)
-    with pytest.raises(UserError, match="No two photos"):
-        poses.poses(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["images"]
-
-
-def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
-    monkeypatch.setattr(poses, "find_poses", None)
-    write_blank(tmp_path, 2)
-    (tmp_path / "images" / "2.png").write_bytes(b"no picture")
-    with pytest.raises(UserError, match=r"2\.png"):
-        poses.poses(tmp_path)
-    shutil.rmtree(tmp_path / "images")
-    write_blank(tmp_path, 3)
-    with pytest.raises(UserError, match="--lens EYE is none of the camera models"):
-        poses.poses(tmp_path, lens="EYE")
-    assert [path.name for path in tmp_path.iterdir()] == ["images"]
-
-
-def test_photos_that_colmap_does_not_read_are_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(poses, "find_poses", None)
-    write_blank(tmp_path, 3)
+@pytest.fixture
+def blank(tmp_path) -> Path:
+    """Three photos that show nothing."""
+    (tmp_path / "images").mkdir()
     for number in range(3):
-        (tmp_path / "images" / f"{number}.png").rename(tmp_path / "images" / f"{number}.webp")
-    with pytest.raises(UserError, match=r"has 0 photos.*Not read: 3 \.webp; make JPEGs of them"):
-        poses.poses(tmp_path)
-    shutil.rmtree(tmp_path / "images")
-    write_blank(tmp_path, 3)
-    (tmp_path / "images" / "0.png").rename(tmp_path / "images" / os.fsdecode(b"\xe9.png"))
-    with pytest.raises(UserError, match="is not UTF-8; rename it"):
-        poses.poses(tmp_path)
+        Image.new("RGB", (64, 48), (number, 90, 120)).save(tmp_path / "images" / f"{number}.png")
+    return tmp_path / "images"
 
 
-def test_photos_of_two_sizes_have_two_lenses(tmp_path, monkeypatch, capsys):
-    write_blank(tmp_path, 3)
-    (tmp_path / "images" / "._0.png").write_bytes(b"what macOS leaves on other systems' disks")
+def test_photos_that_show_nothing_are_refused_and_nothing_is_left(blank):
+    with pytest.raises(UserError, match="No two photos"):
+        poses.poses(blank.parent)
+    assert os.listdir(blank.parent) == ["images"]
+
+
+def no_picture(photo: Path) -> None:
+    photo.write_bytes(b"no picture")
+
+
+def no_text(photo: Path) -> None:
+    photo.rename(photo.with_name(os.fsdecode(b"\xe9.png")))
+
+
+def not_of_colmaps(photo: Path) -> None:
+    photo.rename(photo.with_suffix(".webp"))
+
+
+def of_phones(photo: Path) -> None:
+    photo.unlink()
+    for name in ("a.HEIC", "b.HEIC", "c.CR2", "notes.txt"):
+        photo.with_name(name).touch()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "said"),
+    [
+        (no_picture, {}, r"0\.png is not a picture"),
+        (no_text, {}, "is not UTF-8; rename it"),
+        (not_of_colmaps, {}, r"has 2 photos.* Not read: 1 \.webp; make JPEGs of them"),
+        (of_phones, {}, r"has 2 photos.* Not read: 1 \.CR2, 2 \.HEIC; .*jpg \*\.HEIC"),
+        (Path.exists, {"lens": "EYE"}, "--lens EYE is none of the camera models"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_begins(blank, monkeypatch, spoil, options, said):
+    monkeypatch.setattr(poses, "find_poses", None)
+    spoil(blank / "0.png")
+    with pytest.raises(UserError, match=said):
+        poses.poses(blank.parent, **options)
+    assert os.listdir(blank.parent) == ["images"]
+
+
+def test_photos_of_two_sizes_have_two_lenses_and_others_are_told(blank, monkeypatch, capsys):
+    (blank / "._0.png").write_bytes(b"what macOS leaves on other systems' disks")
+    (blank / "a.HEIC").touch()
     tasks: list[poses.Task] = []
     monkeypatch.setattr(poses, "find_poses", lambda task, _: tasks.append(task))
     for size in ((64, 48), (48, 64)):
-        Image.new("RGB", size).save(tmp_path / "images" / "9.png")
+        Image.new("RGB", size).save(blank / "9.png")
         with pytest.raises(UserError, match="No two photos"):
-            poses.poses(tmp_path)
+            poses.poses(blank.parent)
     assert [(len(task.names), task.one_lens) for task in tasks] == [(4, True), (4, False)]
-    assert "Photos of 2 sizes" in capsys.readouterr().out
-
-
-def test_what_phones_write_and_nothing_reads_is_told(tmp_path, monkeypatch, capsys):
-    write_blank(tmp_path, 2)
-    for name in ("a.HEIC", "b.HEIC", "c.CR2", "notes.txt"):
-        (tmp_path / "images" / name).touch()
-    with pytest.raises(UserError, match=r"has 2 photos.* Not read: 1 \.CR2, 2 \.HEIC; .*jpg \*\.HEIC"):
-        poses.poses(tmp_path)
-    Image.new("RGB", (64, 48)).save(tmp_path / "images" / "2.png")
-    monkeypatch.setattr(poses, "find_poses", lambda *_: None)
-    with pytest.raises(UserError, match="No two photos"):
-        poses.poses(tmp_path)
-    assert "Not read: 1 .CR2, 2 .HEIC" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.count("Photos of 2 sizes") == 1
+    assert said.count("Not read: 1 .HEIC") == 2
 
 
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):

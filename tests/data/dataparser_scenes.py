@@ -20,6 +20,8 @@ from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
 SIZES = ((61, 41), (47, 33))
 """Of the two cameras; odd, so that halving rounds down."""
 NAMES = [f"{'left' if i % 2 else 'right'}/{i // 2:04d}.png" for i in range(10)]
+XYZ = np.arange(12.0).reshape(4, 3)
+"""Of the points of `write_cloud`, if nothing else is said."""
 
 
 def write_model(
@@ -93,26 +95,51 @@ def refusal(data: Path, **options) -> str:
     return str(caught.value)
 
 
-def write_transforms(scene: Path, **extra) -> dict:
-    """The COLMAP scene of the fixture as nerfstudio would write it, in place of the model."""
+def write_transforms(scene: Path, change: Callable[[dict], None] = lambda _: None, **extra) -> dict:
+    """The COLMAP scene of the fixture as nerfstudio would write it, in place of the model. `change` is done
+    to each frame, and `extra` stands beside them."""
     model = read_colmap(scene, scene / "sparse/0")
     shutil.rmtree(scene / "sparse")
     frames = []
     for frame in reversed(model.frames):
-        intrinsics = {"fl_x": frame.lens.fx, "fl_y": frame.lens.fy, "cx": frame.lens.cx, "cy": frame.lens.cy}
-        pose = np.concatenate([frame.camera_to_world, [[0, 0, 0, 1]]]).tolist()
-        size = {"w": frame.lens.width, "h": frame.lens.height}
+        lens, pose = frame.lens, np.concatenate([frame.camera_to_world, [[0, 0, 0, 1]]]).tolist()
+        intrinsics = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        size = {"w": lens.width, "h": lens.height}
         frames.append({"file_path": f"images/{frame.name}", "transform_matrix": pose, **intrinsics, **size})
-    rows = "\n".join(
-        " ".join(map(str, [*p, *c])) for p, c in zip(model.points_xyz, model.points_rgb, strict=True)
-    )
-    types = [f"property double {axis}\n" for axis in "xyz"]
-    types += [f"property uint8 {color}\n" for color in ("red", "green", "blue")]
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(model.points_xyz)}\n{''.join(types)}end_header\n"
-    (scene / "points.ply").write_text(head + rows + "\n")
+        change(frames[-1])
+    write_cloud(scene / "points.ply", "uint8", model.points_rgb, xyz=model.points_xyz)
     meta = {"ply_file_path": "points.ply", "applied_transform": Z_UP.tolist(), "frames": frames, **extra}
-    (scene / "transforms.json").write_text(json.dumps(meta))
+    save_transforms(scene, meta)
     return meta
+
+
+def save_transforms(scene: Path, meta: dict) -> None:
+    (scene / "transforms.json").write_text(json.dumps(meta))
+
+
+def write_cloud(
+    path: Path,
+    kind: str,
+    rgb: np.ndarray,
+    names: tuple[str, ...] = ("red", "green", "blue"),
+    xyz: np.ndarray = XYZ,
+) -> Path:
+    """An ascii .ply of points with colours of a type."""
+    types = [*(f"property double {axis}" for axis in "xyz"), *(f"property {kind} {name}" for name in names)]
+    rows = [" ".join(map(str, row)) for row in np.c_[xyz.astype(object), rgb.astype(object)]]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(xyz)}", *types, "end_header"]
+    path.write_text("\n".join([*head, *rows, ""]))
+    return path
+
+
+def add_mask(scene: Path, frame: dict, called: str = "masks/{path}") -> Path:
+    """A white mask for a frame of transforms.json; `called` is its path by the parts of the photo's."""
+    photo = Path(frame["file_path"])
+    frame["mask_path"] = called.format(path=photo, folder=photo.parent, stem=photo.stem, name=photo.name)
+    path = scene / frame["mask_path"]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("L", (frame["w"], frame["h"]), 255).save(path)
+    return path
 
 
 def png_that_claims(size: tuple[int, int], mode: str = "RGB", depth: int = 8) -> bytes:

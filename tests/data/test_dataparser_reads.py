@@ -17,6 +17,7 @@ from tests.data.dataparser_scenes import (
     parser,
     project,
     project_pycolmap,
+    save_transforms,
     write_capture,
     write_model,
     write_photos,
@@ -30,9 +31,7 @@ from tests.data.dataparser_scenes import (
 def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, offset):
     model = write_capture(tmp_path, text=text, offset=offset)
     outputs = parser(tmp_path, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
-    assert [path.relative_to(tmp_path / "images").as_posix() for path in outputs.image_filenames] == sorted(
-        NAMES
-    )
+    assert outputs.image_filenames == [tmp_path / "images" / name for name in sorted(NAMES)]
     for row, name in enumerate(sorted(NAMES)):
         width, height = SIZES[NAMES.index(name) % 2]
         size = np.array([width // factor, height // factor])
@@ -115,13 +114,11 @@ def test_zero_distortion_is_a_pinhole(tmp_path):
 
 def test_reduced_folder_is_used_where_it_fits(scene):
     write_photos(scene / "images_2", divide=2, rounded=lambda x: int(x + 0.5))
-    outputs = parser(scene, downscale_factor=2).get_dataparser_outputs()
-    assert all(path.is_relative_to(scene / "images_2") for path in outputs.image_filenames)
-    first = outputs.metadata["photos"][0]
-    full = SIZES[NAMES.index(first.path.relative_to(scene / "images_2").as_posix()) % 2]
-    assert first.size == ((full[0] + 1) // 2, (full[1] + 1) // 2)
-    ratio = outputs.cameras.fx[0].item() / (full[0] * 0.9)
-    assert ratio == pytest.approx(first.size[0] / full[0], rel=1e-6)
+    found = parser(scene, downscale_factor=2).prepared()
+    for frame, source, lens in zip(found.scene.frames, found.sources, found.lenses, strict=True):
+        assert source.path == scene / "images_2" / frame.name
+        assert source.size == lens.size == tuple((side + 1) // 2 for side in frame.lens.size)
+        assert lens.fx / frame.lens.fx == pytest.approx(lens.width / frame.lens.width)
 
 
 def test_reduced_folder_that_does_not_fit_is_left_alone(scene, capsys):
@@ -156,12 +153,11 @@ def test_transforms_json_is_the_same_scene(scene, direct):
 
 
 def test_applied_scale_is_undone_on_the_way_back(scene):
-    plain = write_transforms(scene)
-    centers = parser(scene).get_dataparser_outputs()
-    (scene / "transforms.json").write_text(json.dumps({**plain, "applied_scale": 0.25}))
+    meta = write_transforms(scene)
+    plain = parser(scene).get_dataparser_outputs()
+    save_transforms(scene, meta | {"applied_scale": 0.25})
     scaled = parser(scene).get_dataparser_outputs()
-    assert torch.equal(scaled.cameras.camera_to_worlds, centers.cameras.camera_to_worlds)
-    back, quarter = (
-        o.transform_poses_to_original_space(o.cameras.camera_to_worlds) for o in (scaled, centers)
-    )
+    poses = plain.cameras.camera_to_worlds
+    assert torch.equal(scaled.cameras.camera_to_worlds, poses)
+    back, quarter = (found.transform_poses_to_original_space(poses) for found in (scaled, plain))
     assert torch.allclose(back[..., 3], quarter[..., 3] / 0.25, atol=1e-5)

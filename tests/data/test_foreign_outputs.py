@@ -67,9 +67,8 @@ def test_photos_and_cameras_are_those_that_splatfacto_trains_on(tmp_path, kind, 
     for row, (camera, data) in enumerate(theirs):
         wanted = ours.cameras[row]
         for name in ("fx", "fy", "cx", "cy", "width", "height"):
-            assert torch.allclose(getattr(camera, name).ravel(), getattr(wanted, name).ravel(), atol=1e-3), (
-                name
-            )
+            found = getattr(camera, name).item()
+            assert found == pytest.approx(getattr(wanted, name).item(), abs=1e-3), name
         difference = data["image"].int() - ours.get_data(row, "uint8")["image"].int()
         assert difference.abs().max() <= 1
     assert ours.cameras.distortion_params is None
@@ -86,18 +85,15 @@ def test_transparent_photos_lie_on_the_readers_colour(tmp_path):
     assert AbcdDataset(kept).get_data(0, "uint8")["image"].shape == (24, 32, 4)
 
 
-def test_masks_come_along(photo):
+def test_masks_come_along_but_are_not_taken_for_missing_photos(photo):
     mask = np.full((24, 32), 255, np.uint8)
     mask[:5] = 0
     Image.fromarray(mask).save(photo.parent / "mask.png")
-    outputs = outputs_of(photo)
-    outputs.mask_filenames = [photo.parent / "mask.png"]
-    assert np.array_equal(AbcdDataset(outputs)[0]["mask"][..., 0], mask > 0)
-
-
-def test_a_mask_beside_a_missing_photo_is_not_taken_for_it(photo):
     outputs = outputs_of(photo.with_suffix(".jpg"))
-    assert AbcdDataset(outputs).photos.sources[0].path == photo
+    outputs.mask_filenames = [photo.parent / "mask.png"]
+    dataset = AbcdDataset(outputs)
+    assert dataset.photos.sources[0].path == photo
+    assert np.array_equal(dataset[0]["mask"][..., 0], mask > 0)
     outputs.mask_filenames = [photo]
     with pytest.raises(InputError, match="is all there is of"):
         AbcdDataset(outputs)
@@ -116,15 +112,13 @@ def test_a_larger_photo_is_reduced_to_its_camera(photo):
         ({"width": 64, "height": 48}, "is 32 x 24 but its camera is 64 x 48"),
         ({"width": 24, "height": 24}, "is 32 x 24 but its camera is 24 x 24"),
         ({"camera_type": CameraType.EQUIRECTANGULAR}, "is equirectangular"),
-        ({"distortion_params": torch.tensor([[0.0, 0, 0, 0.1, 0, 0]])}, "k4 = 0.1"),
-        ({"fx": 1e9}, "focal length"),
+        ({"distortion_params": torch.tensor([[0.0, 0, 0, 0.1, 0, 0]])}, "has k4 = 0.1"),
+        ({"fx": 1e9}, "has the focal length"),
     ],
 )
 def test_cameras_that_cannot_be_are_named(photo, camera, says):
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError, match=f"{photo} {says}"):
         with_photos(outputs_of(photo, **camera))
-    assert str(photo) in str(refused.value)
-    assert says in str(refused.value)
 
 
 @pytest.mark.parametrize(("share", "held_out"), [(0.6, 2), (0.8, 1), (1.0, 0)])
@@ -145,13 +139,6 @@ def test_a_path_of_windows_is_found(photo):
     assert source.path == photo
 
 
-def test_poses_that_another_reader_could_not_turn_are_refused(photo):
-    outputs = outputs_of(photo)
-    outputs.cameras.camera_to_worlds[:] = torch.nan
-    with pytest.raises(InputError, match="--orientation-method"):
-        with_photos(outputs)
-
-
 def test_files_that_are_not_there_are_named_unless_nobody_looks_at_them(tmp_path):
     outputs = outputs_of(tmp_path / "gone.png")
     with pytest.raises(InputError, match=r"gone\.png cannot be read"):
@@ -160,8 +147,11 @@ def test_files_that_are_not_there_are_named_unless_nobody_looks_at_them(tmp_path
     assert source.size == (32, 24)
 
 
-def test_a_colour_for_masked_pixels_is_refused(photo):
+def test_what_another_reader_cannot_do_is_refused(photo):
     outputs = outputs_of(photo)
+    outputs.cameras.camera_to_worlds[:] = torch.nan
+    with pytest.raises(InputError, match="--orientation-method"):
+        with_photos(outputs)
     outputs.metadata = {"mask_color": (0, 0, 0)}
     with pytest.raises(InputError, match="--mask-color has no effect here"):
         with_photos(outputs)
@@ -184,17 +174,16 @@ def test_a_capture_without_points_has_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("config", "says"),
+    ("config", "called"),
     [
-        (lambda data: ColmapDataParserConfig(data=data), "colmap cannot read"),
-        (lambda data: NerfstudioDataParserConfig(data=data), "nerfstudio-data cannot read"),
-        (lambda data: BlenderDataParserConfig(data=data), "blender-data cannot read"),
+        (ColmapDataParserConfig, "colmap"),
+        (NerfstudioDataParserConfig, "nerfstudio-data"),
+        (BlenderDataParserConfig, "blender-data"),
     ],
 )
-def test_what_another_reader_stumbles_over_is_one_line(scene, config, says):
+def test_what_another_reader_stumbles_over_is_one_line(scene, config, called):
     with pytest.raises(InputError) as refused:
-        inspect(config(scene))
-    assert says in str(refused.value)
-    assert str(scene) in str(refused.value)
-    assert "--help` lists its options" in str(refused.value)
-    assert len(refused.value.lines) == 1
+        inspect(config(data=scene))
+    (line,) = refused.value.lines
+    for words in (f"{called} cannot read", str(scene), "--help` lists its options"):
+        assert words in line

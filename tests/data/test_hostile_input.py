@@ -1,6 +1,5 @@
 """Faults rarer than a missing photo: each is one line, found before training, and all at once."""
 
-import json
 import re
 from pathlib import Path
 
@@ -12,16 +11,13 @@ from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import (
     NAMES,
+    add_mask,
     parser,
     png_that_claims,
     refusal,
     write_capture,
     write_transforms,
 )
-
-
-def rewrite(scene: Path, meta: dict) -> None:
-    (scene / "transforms.json").write_text(json.dumps(meta))
 
 
 def check_refusal(scene: Path, **options) -> list[str]:
@@ -87,14 +83,8 @@ def test_points_that_no_photo_shows_are_refused_in_one_line(scene):
 
 def write_masks(scene: Path) -> list[Path]:
     """A white mask for every frame of a new transforms.json."""
-    meta = write_transforms(scene)
     paths = []
-    for frame in meta["frames"]:
-        frame["mask_path"] = frame["file_path"].replace("images", "masks")
-        paths.append(scene / frame["mask_path"])
-        paths[-1].parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", (frame["w"], frame["h"]), 255).save(paths[-1])
-    rewrite(scene, meta)
+    write_transforms(scene, lambda frame: paths.append(add_mask(scene, frame)))
     return paths
 
 
@@ -107,24 +97,19 @@ def test_masks_of_no_use_are_all_found_before_training(scene):
     Image.new("L", (99, 3), 255).save(masks[1])
     masks[2].write_bytes(masks[2].read_bytes()[:60])
     lines = check_refusal(scene)
-    for path, message in zip(
-        masks, ("hides the whole photo", "unlike its photo", "cannot be decoded"), strict=False
-    ):
-        assert sum(str(path) in line and message in line for line in lines) == 1
+    faults = ("hides the whole photo", "unlike its photo", "cannot be decoded")
+    for path, fault in zip(masks[:3], faults, strict=True):
+        assert sum(str(path) in line and fault in line for line in lines) == 1
     assert len(lines) == 3
 
 
 def test_one_missing_mask_of_all_photos_is_one_line_that_calls_it_a_mask(scene):
-    write_masks(scene)
-    meta = json.loads((scene / "transforms.json").read_text())
-    for frame in meta["frames"]:
-        frame["mask_path"] = "masks/all.png"
-    rewrite(scene, meta)
+    write_transforms(scene, lambda frame: frame.update(mask_path="all.png"))
     (line,) = check_refusal(scene)
-    assert line.endswith("masks/all.png cannot be read (No such file or directory); copy the mask there.")
-    (scene / "masks/all.png").write_bytes(b"")
+    assert line.endswith("all.png cannot be read (No such file or directory); copy the mask there.")
+    (scene / "all.png").write_bytes(b"")
     (line,) = check_refusal(scene)
-    assert line.endswith("masks/all.png is empty; copy the mask again.")
+    assert line.endswith("all.png is empty; copy the mask again.")
 
 
 @pytest.mark.parametrize("size", [(30_000, 20_000), (60_000, 60_000)])
@@ -139,11 +124,7 @@ def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
 
 
 def test_masks_are_no_photos_without_pose(scene, capsys):
-    meta = write_transforms(scene)
-    for frame in meta["frames"]:
-        frame["mask_path"] = frame["file_path"].replace(".png", "-mask.png")
-        Image.new("L", (frame["w"], frame["h"]), 255).save(scene / frame["mask_path"])
-    rewrite(scene, meta)
+    write_transforms(scene, lambda frame: add_mask(scene, frame, "{folder}/{stem}-mask.png"))
     inspect(parser(scene).config)
     assert "have no pose" not in capsys.readouterr().out
 
@@ -162,7 +143,7 @@ def held_out(scene: Path, **options) -> tuple[list[str], list[str]]:
 def test_lists_of_the_data_decide_what_is_held_out(scene, where):
     wanted = sorted(NAMES)[3:5]
     if where == "transforms":
-        rewrite(scene, write_transforms(scene) | {"test_filenames": [f"images/{name}" for name in wanted]})
+        write_transforms(scene, test_filenames=[f"images/{name}" for name in wanted])
     else:  # what one list leaves is on the other side
         listed = wanted if where == "test list" else set(NAMES) - set(wanted)
         (scene / where.replace(" ", "_")).with_suffix(".txt").write_text("\n".join(listed) + "\n")
@@ -188,7 +169,7 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
         (scene / "train_list.txt").write_text("elsewhere.png\n")
     else:
         lists = {"test_filenames": [f"images/{n}" for n in unknown], "train_filenames": ["elsewhere.png"]}
-        rewrite(scene, write_transforms(scene) | lists)
+        write_transforms(scene, **lists)
     lines = refusal(scene).splitlines()
     assert len(lines) == 2
     assert "train" in lines[0]
@@ -197,9 +178,7 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
     assert f"names 4 photos without a pose ({shown}, ...)" in lines[1]
 
 
-@pytest.mark.parametrize(
-    ("kept", "message"), [(0, "nothing to hold out"), (len(NAMES), "nothing to train on")]
-)
-def test_lists_that_leave_one_side_empty_are_refused(scene, kept, message):
+@pytest.mark.parametrize(("kept", "side"), [(0, "hold out"), (len(NAMES), "train on")])
+def test_lists_that_leave_one_side_empty_are_refused(scene, kept, side):
     (scene / "test_list.txt").write_text("\n".join(NAMES[:kept]))
-    assert message in refusal(scene)
+    assert f"nothing to {side}" in refusal(scene)

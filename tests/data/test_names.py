@@ -17,6 +17,7 @@ from tests.data.dataparser_scenes import (
     SIZES,
     parser,
     refusal,
+    save_transforms,
     write_capture,
     write_model,
     write_photos,
@@ -26,9 +27,10 @@ from tests.data.dataparser_scenes import (
 WINDOWS = "C:\\Users\\me\\scan\\images\\"
 
 
-def paths_of(scene: Path, **options) -> set[str]:
+def paths_of(scene: Path, split: str = "all", **options) -> set[str]:
     """Of the photos that are read, from the scene on."""
-    paths = parser(scene, eval_mode="all", **options).get_dataparser_outputs().image_filenames
+    mode = "all" if split == "all" else "auto"
+    paths = parser(scene, eval_mode=mode, **options).get_dataparser_outputs(split).image_filenames
     return {path.relative_to(scene).as_posix() for path in paths}
 
 
@@ -53,10 +55,9 @@ def test_transforms_of_other_machines_find_their_photos(scene, called):
     for frame in meta["frames"]:
         frame["file_path"] = called(frame["file_path"].removeprefix("images/"))
     meta["test_filenames"] = [frame["file_path"] for frame in meta["frames"][:2]]
-    (scene / "transforms.json").write_text(json.dumps(meta))
+    save_transforms(scene, meta)
     assert paths_of(scene) == IMAGES
-    tested = parser(scene).get_dataparser_outputs("test").image_filenames
-    assert {path.relative_to(scene).as_posix() for path in tested} == set(wanted)
+    assert paths_of(scene, "test") == set(wanted)
 
 
 OTHERWISE = [
@@ -75,7 +76,7 @@ def test_models_of_other_machines_find_their_photos(tmp_path, called, capsys):
     (tmp_path / "test_list.txt").write_text(f"{called(NAMES[0])}\n", encoding="utf-8-sig")
     assert paths_of(tmp_path) == IMAGES
     assert re.search(r"10 files have other names \(.*\)", capsys.readouterr().out)
-    assert len(parser(tmp_path).get_dataparser_outputs("test").image_filenames) == 1
+    assert paths_of(tmp_path, "test") == {f"images/{NAMES[0]}"}
 
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
@@ -85,8 +86,7 @@ def test_lists_of_other_machines_find_their_photos(scene, kind, called):
         (scene / "test_list.txt").write_text(f"{called(NAMES[3])}\n")
     else:
         write_transforms(scene, test_filenames=[called(f"images/{NAMES[3]}")])
-    held_out = parser(scene).get_dataparser_outputs("test").image_filenames
-    assert held_out == [scene / "images" / NAMES[3]]
+    assert paths_of(scene, "test") == {f"images/{NAMES[3]}"}
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
@@ -102,8 +102,15 @@ def put(path: Path) -> None:
     path.write_bytes(b"x")
 
 
-def save_transforms(scene: Path, encoding: str) -> None:
+def encode_transforms(scene: Path, encoding: str) -> None:
     (scene / "transforms.json").write_bytes(json.dumps(write_transforms(scene)).encode(encoding))
+
+
+def put_no_model(scene: Path) -> None:
+    """Whatever it is called."""
+    write_transforms(scene)
+    put(scene / "cameras.txt")
+    put(scene / "images.txt")
 
 
 @pytest.mark.parametrize(
@@ -112,14 +119,9 @@ def save_transforms(scene: Path, encoding: str) -> None:
         lambda scene: put(scene / "images/left/._0000.png"),
         lambda scene: put(scene / "images/left/@eaDir/0000.png/THUMB_M.jpg"),
         lambda scene: put(scene / "images/left/__MACOSX/0000.png"),
-        lambda scene: save_transforms(scene, "utf-8-sig"),
-        lambda scene: save_transforms(scene, "utf-16"),
-        # No model, whatever it is called.
-        lambda scene: [
-            save_transforms(scene, "utf-8"),
-            put(scene / "cameras.txt"),
-            put(scene / "images.txt"),
-        ],
+        lambda scene: encode_transforms(scene, "utf-8-sig"),
+        lambda scene: encode_transforms(scene, "utf-16"),
+        put_no_model,
         lambda scene: (scene / "images").rename(scene / "Images"),
     ],
 )
@@ -170,9 +172,8 @@ def test_where_a_model_lies_is_told(scene):
     assert "abcd poses" not in said
     assert paths_of(scene, colmap_path=Path("dense/0")) == IMAGES
     shutil.move(scene / "images", scene / "photos")
-    assert "or set --pipeline.datamanager.dataparser.images-path photos" in refusal(
-        scene, colmap_path=Path("dense/0")
-    )
+    said = refusal(scene, colmap_path=Path("dense/0"))
+    assert "or set --pipeline.datamanager.dataparser.images-path photos" in said
 
 
 # Points
@@ -193,8 +194,7 @@ def test_a_model_without_points_starts_at_random(tmp_path, text, cloud, capsys):
 
 @pytest.mark.parametrize("value", [None, ""])
 def test_no_cloud_may_be_named_as_none(scene, value):
-    meta = write_transforms(scene, ply_file_path=value)
-    (scene / "transforms.json").write_text(json.dumps(meta | {"ply_file_path": value}))
+    write_transforms(scene, ply_file_path=value)
     assert "points3D_xyz" not in parser(scene).get_dataparser_outputs().metadata
 
 

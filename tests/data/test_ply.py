@@ -1,26 +1,14 @@
 """Clouds as scanners and photogrammetry write them: colours of any type, range and name."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.ply import read_points
-from tests.data.dataparser_scenes import parser, write_transforms
+from tests.data.dataparser_scenes import XYZ, parser, write_cloud, write_transforms
 
-XYZ = np.arange(12.0).reshape(4, 3)
 RGB = np.array([[0, 128, 255], [10, 20, 30], [255, 255, 255], [90, 0, 3]])
 NAMES = ("red", "green", "blue")
-
-
-def write_cloud(path: Path, kind: str, rgb: np.ndarray, names: tuple[str, ...] = NAMES) -> Path:
-    """Ascii, with colours of a type."""
-    types = [*(f"property float {axis}" for axis in "xyz"), *(f"property {kind} {name}" for name in names)]
-    rows = [" ".join(map(str, row)) for row in np.c_[XYZ.astype(object), rgb.astype(object)]]
-    head = ["ply", "format ascii 1.0", f"element vertex {len(XYZ)}", *types, "end_header"]
-    path.write_text("\n".join([*head, *rows, ""]))
-    return path
 
 
 @pytest.mark.parametrize("names", [NAMES, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("R", "G", "B")])
@@ -65,13 +53,12 @@ def test_a_cloud_may_stand_for_a_models_points(scene):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_binary_clouds(tmp_path, order):
-    row = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in NAMES]
+    row = [(name, order + "f8") for name in "xyz"] + [(name, "u1") for name in NAMES]
     table = np.array([(*p, *c) for p, c in zip(XYZ, RGB, strict=True)], dtype=row)
-    kind = "little" if order == "<" else "big"
-    types = "".join(f"property {'uchar' if t == 'u1' else 'float'} {name}\n" for name, t in row)
-    form = f"comment some\nformat binary_{kind}_endian 1.0\n"
-    head = f"ply\n{form}element vertex 4\n{types}end_header\n".encode()
-    path = tmp_path / "points.ply"
+    path = write_cloud(tmp_path / "points.ply", "uchar", RGB)
+    form = f"format binary_{'little' if order == '<' else 'big'}_endian 1.0\n"
+    head, end, _ = path.read_text().replace("format ascii 1.0\n", form).partition("end_header\n")
+    head = (head + end).encode()
     path.write_bytes(head + table.tobytes())
     assert np.array_equal(read_points(path)[0], XYZ)
     assert np.array_equal(read_points(path)[1], RGB)
@@ -90,7 +77,6 @@ def test_binary_clouds(tmp_path, order):
 
 
 def test_a_comment_may_name_the_headers_end(tmp_path):
-    path = tmp_path / "points.ply"
-    head = "ply\nformat ascii 1.0\ncomment before end_header\nelement vertex 1\n"
-    path.write_text(head + "property float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n")
-    assert read_points(path)[0].tolist() == [[1, 2, 3]]
+    path = write_cloud(tmp_path / "points.ply", "uchar", RGB)
+    path.write_text(path.read_text().replace("element", "comment before end_header\nelement", 1))
+    assert np.array_equal(read_points(path)[0], XYZ)

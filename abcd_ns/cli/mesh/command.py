@@ -10,9 +10,8 @@ import torch
 import tyro
 
 from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
-from abcd_ns.cli.export.shown import Box, inside
-from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
+from abcd_ns.cli.export.shown import Box
+from abcd_ns.cli.mesh.surface import without_specks, write_ply
 from abcd_ns.cli.paths import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store.atomic import replacing
@@ -20,10 +19,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.run import SETTINGS_FILE, STORE
 from abcd_ns.units import bytes_in_words
 
-VOXEL_PIXELS = 2.0
-"""The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
 STAY = Frame(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
-MANY = 0.01  # share of the pixels that may be left out without a warning
 
 
 def mesh(
@@ -60,12 +56,13 @@ def mesh(
     _check(out, voxel, box)
     run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
-    from abcd_ns.cli.mesh.views import open_views  # these load nerfstudio, in seconds
+    from abcd_ns.cli.mesh.depth_maps import DepthMaps, open_views  # these load nerfstudio, in seconds
+    from abcd_ns.cli.mesh.fusion import fuse
     from abcd_ns.cli.report.run_folder import pipeline_config
 
     with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:
         maps = DepthMaps(Path(folder), *open_views(store, pipeline_config(run, data)), depth == "median")
-        surface, side = _fuse(maps, voxel and voxel / to.scale, box, to)
+        surface, side = fuse(maps, voxel and voxel / to.scale, box, to)
         if not len(surface.faces):
             raise UserError("There is no surface" + (" in this box." if box else " that three views see."))
         surface = without_specks(surface)
@@ -89,25 +86,3 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
         import open3d  # noqa: F401
     except (ImportError, OSError) as error:
         raise UserError(f"open3d, which fuses depths, is not there ({error}); see `abcd doctor`.") from None
-
-
-def _within(box: Box | None, to: Frame, piece: Piece) -> Piece:
-    """The faces whose middles are in the box, if there is one, in the frame `to`."""
-    if box is None:
-        return piece
-    middles = to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
-    return with_faces(piece, inside(box, middles).numpy())
-
-
-def _fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> tuple[Piece, float]:
-    """The surface within the box, and the side of its voxels, in world units of the run."""
-    from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
-
-    footprints = maps.footprints()
-    if not len(footprints):
-        raise UserError("There is no surface: what the training views show is too transparent.")
-    side = voxel or VOXEL_PIXELS * float(np.median(footprints))
-    surface = weld([_within(box, to, piece) for piece in Fusion(maps, side).pieces()])
-    if (far := float((footprints > FAR * side).mean())) > MANY:
-        print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
-    return surface, side

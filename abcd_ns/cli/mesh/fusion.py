@@ -16,12 +16,18 @@ from jaxtyping import Float64
 from open3d import core
 from torch import Tensor
 
+from abcd_ns.cli.export.shown import Box, inside
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.cli.mesh.surface import Piece, with_faces
+from abcd_ns.cli.mesh.surface import Piece, weld, with_faces
+from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
 from abcd_ns.progress_bar import ProgressBar, tracked
 
+VOXEL_PIXELS = 2.0
+"""The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
+MANY = 0.01  # share of the pixels that may be left out without a warning
 BOX = 16  # side of a box, voxels
 PART_BOXES = 4096
 """About as many as a part has, those around it left out: 0.3 GiB, and as much while vertices are found."""
@@ -106,3 +112,23 @@ class Fusion:
 
 def _image(values: np.ndarray) -> Any:
     return open3d.t.geometry.Image(core.Tensor(values))
+
+
+def fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> tuple[Piece, float]:
+    """The surface within the box, and the side of its voxels, in world units of the run."""
+    footprints = maps.footprints()
+    if not len(footprints):
+        raise UserError("There is no surface: what the training views show is too transparent.")
+    side = voxel or VOXEL_PIXELS * float(np.median(footprints))
+    surface = weld([_within(box, to, piece) for piece in Fusion(maps, side).pieces()])
+    if (far := float((footprints > FAR * side).mean())) > MANY:
+        print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
+    return surface, side
+
+
+def _within(box: Box | None, to: Frame, piece: Piece) -> Piece:
+    """The faces whose middles are in the box, if there is one, in the frame `to`."""
+    if box is None:
+        return piece
+    middles = to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
+    return with_faces(piece, inside(box, middles).numpy())

@@ -139,7 +139,9 @@ class Forecast:
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     """Cut the points into blocks, and time a step; UserError where the device has no room for any block."""
     training = methods.abcd.config.pipeline.training
-    capture = _limited(capture, wanted.max_gaussians, training.seed)
+    if 0 < wanted.max_gaussians < len(capture.points):  # training begins with no more
+        rows = shuffled(len(capture.points), training.seed)[: wanted.max_gaussians]
+        capture = replace(capture, points=capture.points[rows], colors=capture.colors[rows])
     points, views = capture.points, capture.views
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pixels = max(view.full.pixels for view in views)
@@ -173,14 +175,6 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         },
         seconds_per_step=seconds,
     )
-
-
-def _limited(capture: Capture, most: int, seed: int) -> Capture:
-    """With the points that training begins with, where there are more than Gaussians are allowed."""
-    if not 0 < most < len(capture.points):
-        return capture
-    rows = shuffled(len(capture.points), seed)[:most]
-    return replace(capture, points=capture.points[rows], colors=capture.colors[rows])
 
 
 def _fit(budget: int, demand: Demand, wanted: Wanted, seen: float) -> Fit:
