@@ -69,7 +69,7 @@ def parse(line: str) -> None:
         return
     if words[0].startswith("--"):
         return
-    command = cli.find_command(words[0])
+    command = {each.name: each for each in cli.COMMANDS}[words[0]]
     if command.passes_on:
         tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(Path(words[1])), *words[2:]])
         return

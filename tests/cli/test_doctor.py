@@ -42,16 +42,16 @@ NO_GPU = replace(HEALTHY, gpu=None, driver=None)
 TORCHVISION = {"torchvision": "operator torchvision::nms does not exist"}
 
 
-def but(found: Facts = HEALTHY, **changes) -> Facts:
-    return replace(found, **changes)
+def but(**changes) -> Facts:
+    return replace(HEALTHY, **changes)
 
 
 def with_version(**versions) -> Facts:
     return but(versions=HEALTHY.versions | versions)
 
 
-def with_tools(found: Facts = HEALTHY, **tools) -> Facts:
-    return but(found, gsplat=None, build_tools={**HEALTHY.build_tools, **tools})
+def with_tools(tools: dict, **changes) -> Facts:
+    return but(gsplat=None, build_tools={**HEALTHY.build_tools, **tools}, **changes)
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,11 @@ def test_a_healthy_machine_has_no_warnings_and_so_many_workers(capsys, monkeypat
         (NO_GPU, "note", "no-gpu", "CPU"),
         (but(gpu=None, torch_cuda=None), "warning", "torch-without-cuda", "580.1"),
         (but(gpu=None), "warning", "cuda-unavailable", "CUDA_VISIBLE_DEVICES"),
-        (with_tools(but(NO_GPU, built=False), **{COMPILER: None}), "warning", "no-compiler", "g++"),
-        (with_tools(), "note", "gsplat-not-built", "MAX_JOBS"),
-        (with_tools(nvcc=None), "error", "gsplat-cannot-be-built", "nvcc"),
-        (with_tools(ninja=None), "error", "gsplat-cannot-be-built", "ninja"),
-        (with_tools(nvcc="12.4"), "error", "gsplat-cannot-be-built", "12.4"),
+        (with_tools({COMPILER: None}, gpu=None, built=False), "warning", "no-compiler", "g++"),
+        (but(gsplat=None), "note", "gsplat-not-built", "MAX_JOBS"),
+        (with_tools({"nvcc": None}), "error", "gsplat-cannot-be-built", "nvcc"),
+        (with_tools({"ninja": None}), "error", "gsplat-cannot-be-built", "ninja"),
+        (with_tools({"nvcc": "12.4"}), "error", "gsplat-cannot-be-built", "12.4"),
         (but(difference=None, failed="is off"), "error", "self-check", "/cache/kernels"),
         (but(lpips_missing="LPIPS needs weights"), "note", "no-lpips", "LPIPS needs weights"),
     ],

@@ -41,15 +41,33 @@ def run(scene, tmp_path):
     return write_run(tmp_path / "run", scene)
 
 
-def write_run(folder, scene, **header):
-    """A run's folder, as far as exporting goes."""
-    tree = build_kd(scene.means, BLOCKS)
-    folder.mkdir()
+def write_store(folder, scene, blocks, **header):
+    """The store in a run's folder."""
+    tree = build_kd(scene.means, blocks)
+    folder.mkdir(exist_ok=True)
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
         store.commit(stored_blocks(tree, scene), state=RunState().to_json())
+
+
+def write_run(folder, scene, **header):
+    """A run's folder, as far as exporting goes."""
+    write_store(folder, scene, BLOCKS, **header)
     matrix = torch.cat((FRAME.rotation, FRAME.translation[:, None]), dim=1)
     (folder / TRANSFORMS).write_text(json.dumps({"transform": matrix.tolist(), "scale": FRAME.scale}))
     return folder
+
+
+@pytest.fixture
+def exported(run, tmp_path):
+    """`exported(option=...)` is what another reader finds in the .ply of `abcd export`."""
+    path = tmp_path / "scene.ply"
+
+    def vertices(**options) -> np.ndarray:
+        path.unlink(missing_ok=True)
+        assert export(run, out=path, **options) == 0
+        return read(path)
+
+    return vertices
 
 
 def read(path) -> np.ndarray:
@@ -64,31 +82,31 @@ def by_position(vertices) -> np.ndarray:
     return vertices[np.lexsort([vertices[axis] for axis in "xyz"])]
 
 
-def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path):
-    assert export(run, out=tmp_path / "before.ply") == 0
+def change_block(run, change) -> None:
+    """Commit what `change` makes of the state of block 0."""
     with ParameterStore.open(run / "abcd/store") as store:
         state = BlockState.unpacked(Packed(*store.load(0)))
-        store.commit({0: state[3:].packed(), PENDING: state[:3].packed()})
-    assert export(run, out=tmp_path / "after.ply") == 0
-    before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
-    assert np.array_equal(before, after)
+        store.commit({name: part.packed() for name, part in change(state).items()})
 
 
-def test_those_that_nobody_sees_yet_are_left_out(run, tmp_path):
-    with ParameterStore.open(run / "abcd/store") as store:
-        state = BlockState.unpacked(Packed(*store.load(0)))
-        store.commit({0: state[3:].packed()})
-    assert export(run, out=tmp_path / "without.ply") == 0
-    with ParameterStore.open(run / "abcd/store") as store:
-        store.commit({0: replace(state, deferred=torch.arange(len(state)) < 3).packed()})
-    assert export(run, out=tmp_path / "waiting.ply") == 0
-    assert (tmp_path / "waiting.ply").read_bytes() == (tmp_path / "without.ply").read_bytes()
+def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, exported):
+    before = by_position(exported())
+    change_block(run, lambda state: {0: state[3:], PENDING: state[:3]})
+    assert np.array_equal(before, by_position(exported()))
 
 
-def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path, capsys):
-    assert export(run, out=tmp_path / "scene.ply", frame="nerfstudio") == 0
+def test_those_that_nobody_sees_yet_are_left_out(run, exported):
+    before = exported()
+    change_block(run, lambda state: {0: replace(state, deferred=torch.arange(len(state)) < 3)})
+    waiting = exported()
+    change_block(run, lambda state: {0: state[3:]})
+    assert len(waiting) == len(before) - 3
+    assert np.array_equal(waiting, exported())
+
+
+def test_in_the_runs_own_frame_every_value_is_what_is_stored(exported, scene, capsys):
+    found = by_position(exported(frame="nerfstudio"))
     assert "1 Gaussian too transparent to be drawn left out." in capsys.readouterr().out
-    found = by_position(read(tmp_path / "scene.ply"))
     kept = scene[torch.arange(len(scene)) != 7]
     kept = kept[torch.from_numpy(np.lexsort(kept.means.T.numpy()))]
     assert np.array_equal(positions(found), kept.means.numpy())
@@ -101,47 +119,41 @@ def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_pat
     assert np.allclose(found["rot_0"], quats[:, 0], atol=1e-6)
 
 
-def test_the_datas_frame_is_where_the_photos_were_posed(run, scene, tmp_path, capsys):
-    export(run, out=tmp_path / "scene.ply")
-    found = read(tmp_path / "scene.ply")
+def test_the_datas_frame_is_where_the_photos_were_posed(exported, scene, capsys):
+    found, own = exported(), exported(frame="nerfstudio")
     back = FRAME.points(torch.from_numpy(positions(found)))
     distances = torch.cdist(back, scene.means.double()).min(dim=1).values
     assert len(found) == len(scene) - 1
     assert float(distances.max()) < 1e-5
-    export(run, out=tmp_path / "own.ply", frame="nerfstudio")
-    own = read(tmp_path / "own.ply")
     assert np.allclose(np.sort(found["scale_0"]), np.sort(own["scale_0"]) - math.log(FRAME.scale), atol=1e-5)
     assert "299 Gaussians" in capsys.readouterr().out
 
 
-def test_the_blocks_files_together_are_the_scene(run, tmp_path):
-    export(run, out=tmp_path / "whole.ply", frame="nerfstudio")
-    whole = by_position(read(tmp_path / "whole.ply"))
+def test_the_blocks_files_together_are_the_scene(run, exported, tmp_path):
     export(run / "config.yml", out=tmp_path / "parts", by_block=True, frame="nerfstudio")
     parts = sorted((tmp_path / "parts").iterdir())
     assert [path.name for path in parts] == [f"block-{n:04d}.ply" for n in range(1, BLOCKS + 1)]
-    assert np.array_equal(by_position(np.concatenate([read(path) for path in parts])), whole)
+    together = by_position(np.concatenate([read(path) for path in parts]))
+    assert np.array_equal(together, by_position(exported(frame="nerfstudio")))
 
 
 @pytest.mark.parametrize("frame", ["data", "nerfstudio"])
-def test_a_box_holds_what_lies_in_it(run, tmp_path, frame):
-    export(run, out=tmp_path / "whole.ply", frame=frame)
-    everything = positions(read(tmp_path / "whole.ply"))
+def test_a_box_holds_what_lies_in_it(exported, frame):
+    everything = positions(exported(frame=frame))
     low, high = np.quantile(everything, [0.2, 0.7], axis=0)
-    export(run, out=tmp_path / "box.ply", box=(*low, *high), frame=frame)
+    found = positions(exported(box=(*low, *high), frame=frame))
     inside = ((everything >= low) & (everything < high)).all(axis=1)
-    found = positions(read(tmp_path / "box.ply"))
     assert 0 < len(found) < len(everything)
     assert np.array_equal(found, everything[inside])
 
 
-def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
+def test_far_from_the_origin_lost_digits_are_told(run, exported, capsys):
     path = run / TRANSFORMS
     far = json.loads(path.read_text())
     for row, offset in zip(far["transform"], (5e5, 4e6, 100.0), strict=True):
         row[3] -= offset
     path.write_text(json.dumps(far))
-    export(run, out=tmp_path / "far.ply")
+    exported()
     said = capsys.readouterr().out
     assert "rounds positions to 0." in said
     assert "--frame nerfstudio" in said
@@ -153,9 +165,8 @@ def test_sizes_that_spz_cuts_are_told_and_are_what_its_reader_finds(tmp_path, sc
     scene.scales[3] = 7.0
     run = write_run(tmp_path / "run", scene)
     export(run, out=tmp_path / "wide.spz", frame="nerfstudio")
-    assert (
-        f"up to {math.exp(7):,.0f} units wide, .spz holds {WIDEST_SPZ:.0f} at most" in capsys.readouterr().out
-    )
+    said = f"up to {math.exp(7):,.0f} units wide, .spz holds {WIDEST_SPZ:.0f} at most"
+    assert said in capsys.readouterr().out
     gaussforge = pytest.importorskip("gaussforge")
     back = gaussforge.GaussForge().convert((tmp_path / "wide.spz").read_bytes(), "spz", "ply")["data"]
     assert PlyData.read(io.BytesIO(back))["vertex"]["scale_0"].max() == pytest.approx(math.log(WIDEST_SPZ))
@@ -175,8 +186,7 @@ def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):
 
 
 def test_a_run_in_its_warm_up_has_nothing_to_show_yet(run, tmp_path):
-    store_path = run / "abcd/store"
-    with ParameterStore.open(store_path) as store:
+    with ParameterStore.open(run / "abcd/store") as store:
         store.commit({}, state={})
     with pytest.raises(UserError, match="warm-up"):
         export(run, out=tmp_path / "new.ply")

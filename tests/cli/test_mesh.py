@@ -1,6 +1,5 @@
 """`abcd mesh`: the surface of a scene whose surface is known, with no seam between the parts of space."""
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -22,14 +21,12 @@ from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.settings import flat_options, write_settings
 from abcd_ns.run.store import MadeFor
+from tests.cli.test_export import positions, write_store
 from tests.nerfstudio.test_training import configure
 from tests.reference.colmap_scene import LEFT, RIGHT, write_scene
 from tests.reference.scenes import ring_of_views
@@ -136,11 +133,6 @@ def test_specks_are_left_out():
 # -- the command -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    return write_run(tmp_path_factory.mktemp("place"))
-
-
 def write_run(place: Path, **header: Any) -> Path:
     """A run's folder, as far as meshes go, beside its data: the wall of the photos, at z = 0 in the data's
     frame."""
@@ -149,16 +141,17 @@ def write_run(place: Path, **header: Any) -> Path:
     write_settings(config, flat_options(config), folder / "abcd")
     outputs = config.pipeline.datamanager.reader().setup().get_dataparser_outputs("train")
     outputs.save_dataparser_transform(folder / TRANSFORMS)
-    known = json.loads((folder / TRANSFORMS).read_text())
-    matrix = torch.tensor(known["transform"], dtype=torch.float64)
+    to_run = Frame.of(outputs.dataparser_transform, outputs.dataparser_scale)
     x, y = torch.meshgrid(torch.arange(-3, 3, 0.08), torch.arange(-2, 2, 0.08), indexing="xy")
     means = torch.stack((x.flatten(), y.flatten(), torch.zeros(x.numel())), dim=1)
     colors = torch.where(means[:, :1] > 0, torch.tensor(RIGHT) / 255, torch.tensor(LEFT) / 255)
-    wall = Frame(matrix[:, :3], matrix[:, 3], known["scale"]).gaussians(surface_of(means, 0.05, colors))
-    tree = build_kd(wall.means, 2)
-    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
-        store.commit(stored_blocks(tree, wall), state=RunState().to_json())
+    write_store(folder, to_run.gaussians(surface_of(means, 0.05, colors)), 2, **header)
     return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return write_run(tmp_path_factory.mktemp("place"))
 
 
 def photos_of(run: Path) -> Path:
@@ -168,10 +161,8 @@ def photos_of(run: Path) -> Path:
 def read(path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     found = PlyData.read(str(path))
     vertices = found["vertex"].data
-    position, color = (
-        np.stack([vertices[name] for name in names], axis=1) for names in ("xyz", ("red", "green", "blue"))
-    )
-    return position, color, np.stack(found["face"].data["vertex_indices"])
+    color = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
+    return positions(vertices), color, np.stack(found["face"].data["vertex_indices"])
 
 
 def test_the_wall_is_in_the_datas_frame_and_another_reader_finds_it(run, tmp_path, capsys):

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.arguments import check_ranges
-from abcd_ns.cli.plan.wanted import Wanted
+from abcd_ns.cli.plan import Wanted
 from abcd_ns.data.prepare import SceneOptions, read_scene
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError

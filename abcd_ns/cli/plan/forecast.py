@@ -13,7 +13,7 @@ from rich.console import Console
 from torch import Tensor
 
 from abcd_ns import methods
-from abcd_ns.cli.plan.wanted import Wanted
+from abcd_ns.cli.plan import Wanted
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
 from abcd_ns.engine.render import make_rasterizer

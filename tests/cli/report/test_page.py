@@ -11,14 +11,8 @@ import pytest
 import torch
 
 from abcd_ns.cli.report.charts import draw_map
-from abcd_ns.cli.report.figures import (
-    block_rows,
-    changed_options,
-    more_figures,
-    tiles,
-    training_command,
-)
-from abcd_ns.cli.report.held_out import HeldOut, pick
+from abcd_ns.cli.report.figures import block_rows, changed_options, more_figures, tiles, training_command
+from abcd_ns.cli.report.held_out import pick
 from abcd_ns.cli.report.page import render_page
 from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
 from abcd_ns.cli.report.story import read_story
@@ -37,6 +31,7 @@ from tests.cli.report.runs import (
     made_up_settings,
     write_log,
 )
+from tests.lab.compare.records import MACHINE
 from tests.reference.scenes import random_gaussians
 
 HOSTILE = "</title></style><script>alert(1)</script>\"'><img src=http://evil/x onerror=alert(2)>{{ 7*7 }}"
@@ -67,20 +62,14 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def page_of(tmp_path, held_out: HeldOut | None = None, notes=(), **settings) -> tuple[str, Page]:
-    run = made_up_run(tmp_path, **settings)
-    text = render_page(run, held_out, notes=notes)
-    return text, Page(text)
-
-
-def with_lines(run: RunFolder, *more: str) -> RunFolder:
-    log = write_log(run.path / "longer.jsonl", [*log_lines(), *more])
-    return dataclasses.replace(run, story=read_story(log))
+def with_log(run: RunFolder, lines: list[str]) -> RunFolder:
+    return dataclasses.replace(run, story=read_story(write_log(run.path / "other.jsonl", lines)))
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> tuple[str, Page]:
-    return page_of(tmp_path_factory.mktemp("page"), made_up_held_out())
+    text = render_page(made_up_run(tmp_path_factory.mktemp("page")), made_up_held_out())
+    return text, Page(text)
 
 
 def test_the_page_says_what_was_measured(shown, tmp_path):
@@ -126,7 +115,7 @@ def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_an
     pruned = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
     ends = [{"worker": 0, "deaths": 1, "waited": 0.25}, {"worker": 1, "deaths": 0, "waited": 0.05}]
     lines = [line("worker", 40, 16.0, visits=2, **end) for end in ends]
-    found = with_lines(run, *lines, line("pruned at end", 40, 17.0, **pruned))
+    found = with_log(run, [*log_lines(), *lines, line("pruned at end", 40, 17.0, **pruned)])
     assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
     figures = more_figures(found, None)
     assert figures["workers"] == "2, waited 15% of the time, 1 lost"
@@ -136,24 +125,22 @@ def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_an
 
 @pytest.mark.parametrize(("sampled", "ended", "peak"), [(3, 2, "3.00"), (1, 2, "2.00"), (3, None, "3.00")])
 def test_peaks_of_memory_are_those_of_all_processes_of_a_run(tmp_path, sampled, ended, peak):
-    run = made_up_run(tmp_path)
-    machine = dataclasses.replace(run.settings.machine, gpu="made up")
-    memory = {"rss_bytes": sampled << 30, "device_bytes": sampled << 30, "held": {}}
+    run = made_up_run(tmp_path, machine=dataclasses.replace(MACHINE, gpu="made up"))
+    memory = {"rss_bytes": sampled << 30, "device_bytes": sampled << 30}
     lines = [line("training", 0, 0.0, **TRAINING), line("sample", 5, 2.0, **memory)]
     lines += [line("training", 5, 2.0, **TRAINING)]
     if ended is not None:
         lines.append(line("end", 9, 4.0, peak_rss_bytes=ended << 30, peak_device_bytes=ended << 30))
-    story = read_story(write_log(tmp_path / "memory.jsonl", lines))
-    settings = dataclasses.replace(run.settings, machine=machine)
-    name, value, more = tiles(dataclasses.replace(run, story=story, settings=settings), None)[3]
+    name, value, more = tiles(with_log(run, lines), None)[3]
     assert (name, value) == ("peak GPU memory", f"{peak} GiB")
     assert f"RAM {peak} GiB" in more
 
 
 def test_names_are_text_wherever_they_come_from(tmp_path):
     options = {**made_up_settings().options, "pipeline.training.background": HOSTILE, HOSTILE: HOSTILE}
-    hostile = {"scene": HOSTILE, "method": HOSTILE, "data": HOSTILE, "options": options}
-    text, page = page_of(tmp_path, made_up_held_out(HOSTILE), [HOSTILE], **hostile)
+    run = made_up_run(tmp_path, scene=HOSTILE, method=HOSTILE, data=HOSTILE, options=options)
+    text = render_page(run, made_up_held_out(HOSTILE), notes=[HOSTILE])
+    page = Page(text)
     assert page.texts["h1"] == [HOSTILE]
     assert page.texts["title"][0].startswith(HOSTILE)
     assert len(page.all("script")) == 1
@@ -166,28 +153,23 @@ def test_a_map_needs_no_gaussians_in_every_block(tmp_path):
     """Stacked blocks are seen from the side too."""
     checkpoint = made_up_run(tmp_path).checkpoint
     means = checkpoint.means * torch.tensor([1.0, 1.0, 9.0])
-    few = dataclasses.replace(
-        checkpoint, tree=build_kd(means, 3), pipeline={"_model.gauss_params.means": means[:2]}
-    )
-    assert draw_map(few, []).startswith("data:image/svg+xml")
+    few = {"_model.gauss_params.means": means[:2]}
+    found = draw_map(dataclasses.replace(checkpoint, tree=build_kd(means, 3), pipeline=few), [])
+    assert found.startswith("data:image/svg+xml")
 
 
-def test_shown_views_reach_from_the_best_to_the_worst():
+def test_shown_views_reach_from_the_best_to_the_worst_and_open_with_the_median():
     scores = [made_up_score(row, psnr) for row, psnr in enumerate([21.0, 25.0, 23.0, 20.0, 24.0])]
-    assert pick(scores, 1) == {2: "median"}
     assert pick(scores, 2) == {1: "best", 3: "worst"}
     assert pick(scores, 3) == {1: "best", 2: "median", 3: "worst"}
     assert list(pick(scores, 7)) == [1, 4, 2, 0, 3]
     assert pick(scores, 0) == pick([], 3) == {}
-
-
-@pytest.mark.parametrize("views", range(3, 14))
-def test_the_view_that_a_page_opens_with_is_the_median(views):
-    scores = [made_up_score(row, 20.0 - row) for row in range(views)]
-    for wanted in (1, *range(3, views + 1)):
-        words = list(pick(scores, wanted).values())
-        assert len(words) == wanted
-        assert words[(wanted - 1) // 2] == "median"
+    for views in range(3, 14):
+        scores = [made_up_score(row, 20.0 - row) for row in range(views)]
+        for wanted in (1, *range(3, views + 1)):
+            words = list(pick(scores, wanted).values())
+            assert len(words) == wanted
+            assert words[(wanted - 1) // 2] == "median"
 
 
 def test_changed_settings_and_the_command_that_sets_them():

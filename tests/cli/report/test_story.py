@@ -5,18 +5,14 @@ import json
 import pytest
 
 from abcd_ns.cli.report.charts import draw_progress
-from abcd_ns.cli.report.story import Story, read_story
+from abcd_ns.cli.report.story import read_story
 from abcd_ns.lab.results.records import RecordError
 from abcd_ns.nerfstudio.run.log_lines import EndLine, layer_share
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
 
 
-@pytest.fixture
-def story(tmp_path) -> Story:
-    return read_story(write_log(tmp_path / "log.jsonl", log_lines()))
-
-
-def test_a_log_tells_visits_and_totals(story):
+def test_a_log_tells_visits_and_totals(tmp_path):
+    story = read_story(write_log(tmp_path / "log.jsonl", log_lines()))
     assert [visit.block for visit in story.visits] == [None, 0, 1, 2]
     assert layer_share(story.visits) == 3 / 16
     assert [visit.psnr for visit in story.of_block(1)] == [22.0]
