@@ -126,8 +126,7 @@ class Photos:
 
 
 def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[np.ndarray, "y x c"]:
-    """The mean of the source's area that each pixel covers; `size` is (width, height), at most the
-    source's."""
+    """The mean of the area that each pixel covers; `size` is (width, height), at most the source's."""
     if size == (image.shape[1], image.shape[0]):
         return image
     reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -117,8 +117,7 @@ def meant_by(name: str, found: Mapping[str, set[T]], moved: bool = True) -> T | 
 
 
 def visible_files(folder: Path) -> Iterator[Path]:
-    """All files below a folder, through links, too. Not what systems hide there: macOS's ._a.jpg, Synology's
-    @eaDir."""
+    """Files below a folder, through links, too. Not what systems hide: macOS's ._a.jpg, Synology's @eaDir."""
     root, seen = Path(os.path.realpath(folder)), set[Path]()
     for at, folders, names in os.walk(folder, followlinks=True):
         place = Path(os.path.realpath(at))

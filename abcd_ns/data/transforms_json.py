@@ -34,8 +34,7 @@ _UNREAD = (
 
 
 def read_transforms(path: Path) -> Scene:
-    """The scene of a transforms.json file, in its world. Paths in it are relative to its folder, and
-    inside."""
+    """The scene of a transforms.json, in its world. Paths in it are relative to its folder, and inside."""
     meta = _load(path)
     root, problems, frames = path.parent, Problems(), []
     files = FileFinder(root, path)

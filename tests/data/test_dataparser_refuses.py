@@ -10,8 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -96,30 +94,15 @@ def test_names_that_mean_no_photo_or_two_are_refused(tmp_path, names, photos, me
 
 
 @pytest.mark.parametrize("file", [f"{name}.bin" for name in MODEL])
-@settings(
-    derandomize=True,
-    max_examples=25,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(share=st.floats(0, 1, exclude_max=True))
-def test_cut_model_is_refused(scene, file, share):
+def test_a_binary_model_that_is_cut_or_miscounts_is_refused(scene, file):
     path = scene / "sparse/0" / file
     whole = path.read_bytes()
-    try:
-        for size in (max(int(share * len(whole)), 1), len(whole) - 1):
-            path.write_bytes(whole[:size])
-            assert file in refusal(scene)
-        path.write_bytes(whole + b"\0")
-        assert "more than its entries" in refusal(scene)
-    finally:
-        path.write_bytes(whole)
-
-
-@pytest.mark.parametrize("file", [f"{name}.bin" for name in MODEL])
-def test_absurd_counts_are_refused(scene, file):
-    path = scene / "sparse/0" / file
-    path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:])
+    for size in (*range(1, len(whole), max(len(whole) // 40, 1)), len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert file in refusal(scene)
+    path.write_bytes(whole + b"\0")
+    assert "more than its entries" in refusal(scene)
+    path.write_bytes(b"\xff" * 8 + whole[8:])
     assert "claims" in refusal(scene)
     path.unlink()
     os.mkfifo(path)

@@ -178,18 +178,12 @@ def test_reduced_mask_keeps_pixels_that_count_as_a_whole(tmp_path):
     mask = np.where(np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.9, 255, 0).astype(np.uint8)
     saved(tmp_path / "mask.png", mask)
     expected = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).min(axis=(1, 3)) > 0
+    assert 0 < expected.mean() < 1
     reduced = read_mask(tmp_path, "mask.png", HALF)
     assert reduced.dtype == bool
     assert np.array_equal(reduced, expected)
-    assert expected.any()
-    assert not expected.all()
-
-
-def test_mask_may_have_the_reduced_size(tmp_path):
-    mask = np.full(HALF[::-1], 255, np.uint8)
-    mask[3, 5] = 0
-    saved(tmp_path / "mask.png", mask)
-    assert np.array_equal(read_mask(tmp_path, "mask.png", HALF), mask > 0)
+    saved(tmp_path / "half.png", expected)  # it may have that size in its file
+    assert np.array_equal(read_mask(tmp_path, "half.png", HALF), expected)
 
 
 HIDDEN = np.hypot(*np.ogrid[-11:13, -20:20]) < 8

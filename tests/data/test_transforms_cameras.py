@@ -27,16 +27,18 @@ def lenses(scene: Path) -> list:
 
 @WHERE
 @pytest.mark.parametrize(
-    ("values", "fisheye"),
+    ("values", "name", "wanted"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, True),
-        ({"camera_model": "radial_fisheye"}, True),
-        ({"is_fisheye": True}, True),
-        ({"camera_model": "SIMPLE_RADIAL"}, False),
+        ({"camera_model": "OPENCV_FISHEYE"}, "fisheye", True),
+        ({"camera_model": "radial_fisheye"}, "fisheye", True),
+        ({"is_fisheye": True}, "fisheye", True),
+        ({"camera_model": "SIMPLE_RADIAL"}, "fisheye", False),
+        ({"distortion_params": [0.1, 0.01, 0, 0, 1e-3, 0]}, "distortion", (0.1, 0.01, 1e-3, 0, 0)),
+        ({"k1": 0.1, "k2": 0.01, "p1": 1e-3}, "distortion", (0.1, 0.01, 1e-3, 0, 0)),
     ],
 )
-def test_the_camera_model_is_taken_at_either_level(scene, where, values, fisheye):
-    assert {lens.fisheye for lens in lenses(with_camera(scene, where, values))} == {fisheye}
+def test_the_camera_is_taken_at_either_level(scene, where, values, name, wanted):
+    assert {getattr(lens, name) for lens in lenses(with_camera(scene, where, values))} == {wanted}
 
 
 @WHERE
@@ -56,16 +58,6 @@ def test_what_is_not_read_is_refused_by_name_in_one_line(scene, where, values, n
     assert named in said
     assert "9 others have the same fault" in said
     assert "\n" not in said
-
-
-@WHERE
-@pytest.mark.parametrize(
-    "values", [{"distortion_params": [0.1, 0.01, 0, 0, 1e-3, 0]}, {"k1": 0.1, "k2": 0.01, "p1": 1e-3}]
-)
-def test_distortion_is_taken_at_either_level(scene, where, values):
-    assert {lens.distortion[:4] for lens in lenses(with_camera(scene, where, values))} == {
-        (0.1, 0.01, 1e-3, 0)
-    }
 
 
 @WHERE

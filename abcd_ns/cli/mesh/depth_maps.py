@@ -52,8 +52,7 @@ class DepthMaps:
             np.save(self._file("color", number), (color * 255).round().to(torch.uint8).cpu().numpy())
 
     def depth(self, number: int) -> np.ndarray:
-        """Camera z, world units, float32 [h, w], of the view at this place of `views`; 0 where it shows too
-        little."""
+        """Camera z, world units, float32 [h, w], of a view by its place; 0 where it shows too little."""
         return np.load(self._file("depth", number))
 
     def color(self, number: int) -> np.ndarray:
