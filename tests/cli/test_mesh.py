@@ -14,8 +14,7 @@ from torch import Tensor
 from abcd_ns.cli.export.command import TRANSFORMS
 from abcd_ns.cli.mesh.command import mesh
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.cli.mesh.fusion import Fusion
-from abcd_ns.cli.mesh.surface import Piece, weld, without_specks
+from abcd_ns.cli.mesh.fusion import Fusion, Piece, weld, without_specks
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings

@@ -91,7 +91,7 @@ class Survey:
 
 
 def survey(data: Path, downscale: int | None) -> Survey:
-    """Read a scene as training does, and decode all photos; an InputError lists what training would refuse."""
+    """Read a scene as training does, and decode all photos; InputError lists what training would refuse."""
     parser = AbcdDataParser(AbcdDataParserConfig(data=data, downscale_factor=downscale))
     parser.tell = lambda _: None  # notes are among the findings
     prepared, outputs = parser.prepared(), parser.get_dataparser_outputs("train")

@@ -1,1 +1,1 @@
-"""`abcd mesh`: `depth_maps` draws, `fusion` makes of these a surface part by part, `surface` cleans it."""
+"""`abcd mesh`: `depth_maps` draws, `fusion` makes of these a surface, part by part."""

@@ -11,7 +11,6 @@ import tyro
 
 from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
 from abcd_ns.cli.export.shown import Box
-from abcd_ns.cli.mesh.surface import without_specks, write_ply
 from abcd_ns.cli.paths import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store.atomic import replacing
@@ -57,7 +56,7 @@ def mesh(
     run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
     from abcd_ns.cli.mesh.depth_maps import DepthMaps, open_views  # these load nerfstudio, in seconds
-    from abcd_ns.cli.mesh.fusion import fuse
+    from abcd_ns.cli.mesh.fusion import fuse, without_specks, write_ply
     from abcd_ns.cli.report.run_folder import pipeline_config
 
     with stored(run) as store, TemporaryDirectory(prefix=".abcd-mesh-", dir=out.parent) as folder:

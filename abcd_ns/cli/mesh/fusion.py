@@ -6,7 +6,9 @@ the same in each part that has it, and so are the vertices between voxels. Each 
 whose box it begins in: together the parts are, bit for bit, the surface that is fused at once.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +16,17 @@ import open3d
 import torch
 from jaxtyping import Float64
 from open3d import core
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from abcd_ns.cli.export.shown import Box, inside
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.cli.mesh.surface import Piece, weld, with_faces
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
+from abcd_ns.formats.ply import GENERATOR
 from abcd_ns.progress_bar import ProgressBar, tracked
 
 VOXEL_PIXELS = 2.0
@@ -37,6 +41,22 @@ that leave a hole."""
 LEAST_VIEWS = 3  # that must see a place for it to be a part of the surface
 STRIDE = 4  # open3d looks at every fourth pixel, each way, to see where boxes are needed
 FAR = BOX / STRIDE  # voxels that a pixel may cover: with more, boxes would be missed
+SPECK = 0.001  # clusters with fewer faces than this share of the largest one's are left out
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of the surface, or all of it."""
+
+    vertices: np.ndarray
+    """[n, 3], world units; those between two pieces are in both, bit for bit."""
+    colors: np.ndarray
+    """float32 [n, 3], 0..1."""
+    faces: np.ndarray
+    """int64 [m, 3]."""
+
+
+NOTHING = Piece(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
 
 
 class Fusion:
@@ -132,3 +152,48 @@ def _within(box: Box | None, to: Frame, piece: Piece) -> Piece:
         return piece
     middles = to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
     return with_faces(piece, inside(box, middles).numpy())
+
+
+def weld(pieces: Sequence[Piece]) -> Piece:
+    """All pieces as one: vertices with the same position, bit for bit, become one."""
+    pieces = [NOTHING, *pieces]
+    vertices = np.concatenate([piece.vertices for piece in pieces])
+    colors = np.concatenate([piece.colors for piece in pieces])
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)])
+    rows = np.ascontiguousarray(vertices).view(np.dtype((np.void, 12)))[:, 0]
+    _, first, which = np.unique(rows, return_index=True, return_inverse=True)
+    return Piece(vertices[first], colors[first], which[faces])
+
+
+def without_specks(mesh: Piece) -> Piece:
+    """The mesh without its smallest clusters of faces, see SPECK."""
+    count = len(mesh.vertices)
+    ends = mesh.faces[:, :2].T, mesh.faces[:, 1:].T
+    row, column = np.concatenate(ends, axis=1)
+    edges = coo_matrix((np.ones(len(row), bool), (row, column)), shape=(count, count))
+    cluster = connected_components(edges, directed=False)[1][mesh.faces[:, 0]]
+    sizes = np.bincount(cluster)
+    return with_faces(mesh, sizes[cluster] >= SPECK * sizes.max())
+
+
+def with_faces(mesh: Piece, kept: np.ndarray) -> Piece:
+    """Only these faces, and the vertices that they need."""
+    used, faces = np.unique(mesh.faces[kept], return_inverse=True)
+    return Piece(mesh.vertices[used], mesh.colors[used], faces.reshape(-1, 3))
+
+
+def write_ply(path: Path, mesh: Piece) -> None:
+    """Binary, with a colour for each vertex."""
+    vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"], vertices["color"] = mesh.vertices, (mesh.colors * 255).round()
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}"]
+    lines += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    with path.open("wb") as file:
+        file.write(("\n".join(lines) + "\n").encode())
+        file.write(vertices.tobytes())
+        file.write(faces.tobytes())
