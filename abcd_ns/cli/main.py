@@ -35,13 +35,13 @@ class Command(NamedTuple):
 
 COMMANDS = (
     Command("demo", "abcd_ns.cli.demo:demo", "make a small scene, train it, show the result"),
-    Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
+    Command("doctor", "abcd_ns.cli.doctor:doctor", "examine this machine and its packages"),
     Command("poses", "abcd_ns.cli.poses:poses", "find the camera poses of photos, by pycolmap"),
     Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
     Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
     Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", passes_on=True),
     Command("report", "abcd_ns.cli.report.command:report", "write an HTML page about a run"),
-    Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
+    Command("export", "abcd_ns.cli.export:export", "write a scene as .ply, .spz, .sog or .glb"),
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as triangles"),
     Command("compare", "abcd_ns.lab.compare.command:compare", "compare methods, numbers of blocks, options"),
     Command("stability", "abcd_ns.lab.stability.command:stability", "run small scenes on which methods fail"),

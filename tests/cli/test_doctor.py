@@ -10,9 +10,8 @@ import pytest
 import torch
 from torch.utils import cpp_extension
 
-from abcd_ns.cli.doctor import command, facts
-from abcd_ns.cli.doctor.command import TESTED, diagnose, doctor
-from abcd_ns.cli.doctor.facts import COMPILER, PACKAGES, Facts, find_extension
+from abcd_ns.cli import doctor as doctor_module
+from abcd_ns.cli.doctor import COMPILER, PACKAGES, TESTED, Facts, diagnose, doctor, find_extension
 
 GIB = 2**30
 HEALTHY = Facts(
@@ -65,7 +64,7 @@ def with_tools(tools: dict, **changes) -> Facts:
     ],
 )
 def test_a_healthy_machine_has_no_warnings_and_so_many_workers(capsys, monkeypatch, found, workers):
-    monkeypatch.setattr(command, "gather", lambda: found)
+    monkeypatch.setattr(doctor_module, "gather", lambda: found)
     assert doctor() == 0
     shown = capsys.readouterr().out
     assert f"\nworkers         {workers}" in shown
@@ -105,7 +104,7 @@ def test_each_ailment_is_found_with_its_cure(found, level, name, said):
 def test_the_report_names_no_home(monkeypatch, capsys):
     home = str(Path.home())
     found = but(broken={"cv2": f"no {home}/lib.so"}, folder=f"{home}/.cache/x")
-    monkeypatch.setattr(command, "gather", lambda: found)
+    monkeypatch.setattr(doctor_module, "gather", lambda: found)
     doctor(verbose=True)
     said = capsys.readouterr().out
     assert home + "/" not in said
@@ -118,10 +117,10 @@ def test_the_report_names_no_home(monkeypatch, capsys):
 
 def test_this_environment_starts_and_looking_builds_nothing(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(facts, "STARTED", facts.STARTED[:-1])  # open3d takes seconds
+    monkeypatch.setattr(doctor_module, "STARTED", doctor_module.STARTED[:-1])  # open3d takes seconds
     for name in ("ABCD_KERNELS", "TORCH_EXTENSIONS_DIR", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path / name))
-    found = facts.gather()
+    found = doctor_module.gather()
     assert (found.broken, found.failed, found.built, found.gsplat) == ({}, None, False, None)
     assert 0 <= found.difference < 2e-3
     assert found.versions["nerfstudio"] is not None
@@ -133,11 +132,11 @@ def test_modules_that_do_not_start_are_told_with_their_error(monkeypatch, tmp_pa
     (tmp_path / "a_broken_module.py").write_text("raise RuntimeError('no such operator\\nmore')\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    assert facts._start("json") is None
-    assert facts._start("a_broken_module") == "RuntimeError: no such operator"
-    assert facts._start("no_module_of_this_name").startswith("ModuleNotFoundError")
-    monkeypatch.setattr(facts, "EXPORT", "a_broken_module")  # looked at in a process of its own
-    assert facts._start("a_broken_module") == "more"
+    assert doctor_module._start("json") is None
+    assert doctor_module._start("a_broken_module") == "RuntimeError: no such operator"
+    assert doctor_module._start("no_module_of_this_name").startswith("ModuleNotFoundError")
+    monkeypatch.setattr(doctor_module, "EXPORT", "a_broken_module")  # looked at in a process of its own
+    assert doctor_module._start("a_broken_module") == "more"
 
 
 @pytest.mark.parametrize("cuda", [None, "13.0"])
@@ -156,9 +155,9 @@ def test_it_starts_without_torch():
     """Otherwise it could not say what is wrong with torch."""
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from abcd_ns.cli.doctor import command, facts\n"
-        "facts.STARTED = facts.STARTED[:-1]\n"
-        "sys.exit(command.doctor())"
+        "from abcd_ns.cli import doctor\n"
+        "doctor.STARTED = doctor.STARTED[:-1]\n"
+        "sys.exit(doctor.doctor())"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert run.returncode == 1, run.stderr

@@ -10,7 +10,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from abcd_ns.cli.export.command import TRANSFORMS, export, tell_rounding
+from abcd_ns.cli.export import TRANSFORMS, export, tell_rounding
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.packed import Packed

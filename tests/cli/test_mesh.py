@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
-from abcd_ns.cli.export.command import TRANSFORMS
+from abcd_ns.cli.export import TRANSFORMS
 from abcd_ns.cli.mesh.command import mesh
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.cli.mesh.fusion import Fusion, Piece, weld, without_specks

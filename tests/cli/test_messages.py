@@ -1,4 +1,4 @@
-"""No message names an option that no command has."""
+"""Messages: none names an option that no command has; findings look as they should, and are documented."""
 
 import ast
 import io
@@ -11,12 +11,16 @@ from typing import Any
 import pytest
 import tyro
 from nerfstudio.scripts.viewer.run_viewer import RunViewer
+from rich.console import Console
 
 from abcd_ns import methods
 from abcd_ns.cli import main as cli
+from abcd_ns.cli.findings import Finding, print_findings
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 
 PACKAGE = Path(cli.__file__).parents[1]
+DOCUMENT = (PACKAGE.parent / "docs/troubleshooting.md").read_text()
+MAKERS = [*(PACKAGE / "cli/check").glob("*.py"), PACKAGE / "cli/doctor.py"]
 FLAG = re.compile(r"(?<![\w-])--[a-zA-Z][\w.-]*\w")
 ELSEWHERE = {"--ImageReader.single-camera", "--mask-color", "--at", "--output-path", "--version"}
 """Of colmap, of nerfstudio's reader nerfstudio-data, of the report's style, of ns-eval, and of `abcd`."""
@@ -63,3 +67,36 @@ def test_no_help_begins_a_line_within_a_sentence():
     """tyro breaks lines where docstrings have them."""
     lines = [line for target in commands() for line in help_of(target, 160).splitlines()]
     assert [line for line in lines if re.match(r" {6,}[a-z]", line)] == []
+
+
+def printed(*findings: Finding, width: int = 80) -> list[str]:
+    stream = io.StringIO()
+    print_findings(findings, Console(file=stream, width=width))
+    return stream.getvalue().splitlines()
+
+
+def test_groups_are_titled_and_long_ones_cut():
+    name, long = "[red]a.png[/red] :smile:", [Finding("note", str(i), "Too.") for i in range(30)]
+    lines = printed(Finding("note", "n", name), Finding("error", "e", "Bad."), *long)
+    assert lines[:5] == ["", "error", "  e: Bad.", "", "notes (31)"]
+    assert lines[5] == f"  n: {name}"  # names of files are no markup
+    assert lines[24:] == ["  18: Too.", "  ... and 11 more (31 in all)."]
+
+
+def names_in_code() -> set[str]:
+    nodes = (node for path in MAKERS for node in ast.walk(ast.parse(path.read_text())))
+    calls = [(node.func, node.args) for node in nodes if isinstance(node, ast.Call)]
+    # Of `(error if ... else warning)(name)`, either.
+    calls = [(ast.unparse(getattr(maker, "body", maker)), args) for maker, args in calls]
+    place = {"Finding": 1, "error": 0, "warning": 0, "note": 0}
+    return {args[place[maker]].value for maker, args in calls if maker in place}
+
+
+def names_in_document() -> set[str]:
+    headings = re.findall(r"^#### (.+)$", DOCUMENT, re.MULTILINE)
+    return {name for heading in headings for name in heading.split(", ")}
+
+
+def test_the_document_explains_every_finding_and_no_other():
+    assert len(names_in_code()) > 30
+    assert names_in_document() == names_in_code()

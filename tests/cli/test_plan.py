@@ -20,7 +20,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.run.fit import FITTED, Fit, blocks_to_begin_with
 from abcd_ns.units import GIB
-from tests.cli.check.scenes import wide
+from tests.cli.test_check import wide
 from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
 from tests.reference.scenes import random_gaussians, ring_of_views
 

@@ -17,7 +17,7 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from abcd_ns.cli.export.command import export
+from abcd_ns.cli.export import export
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import abcd_ns
-from abcd_ns.cli.export import command
+from abcd_ns.cli import export as export_module
 from abcd_ns.errors import UserError
 from abcd_ns.formats import streamed
 from abcd_ns.formats.levels import MOST_OPAQUE, coarser, merged, pairs
@@ -144,7 +144,7 @@ def test_a_folder_is_what_the_format_describes(run, scene, tmp_path, monkeypatch
 def test_it_takes_a_new_folder_and_leaves_none_behind(run, tmp_path, monkeypatch):  # noqa: F811
     with pytest.raises(UserError, match="leave out --by-block"):
         export(run, out=tmp_path / "garden", lod=True, by_block=True)
-    monkeypatch.setattr(command, "MOST_SOG", 200)
+    monkeypatch.setattr(export_module, "MOST_SOG", 200)
     with pytest.raises(UserError, match=r"\.sog of 299 Gaussians .* use --lod, or .compressed.ply"):
         export(run, out=tmp_path / "garden.sog")
     assert not list(tmp_path.glob("garden*"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from abcd_ns.cli.export.command import export
+from abcd_ns.cli.export import export
 from abcd_ns.data.ply import read_gaussians
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.formats.ply import columns, write_ply

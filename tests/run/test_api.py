@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from abcd_ns import RunOptions, TrainingConfig, UserError, View, train
-from abcd_ns.cli.export.command import export
+from abcd_ns.cli.export import export
 from abcd_ns.engine.events import StepTaken, VisitEnded
 from abcd_ns.nerfstudio.views import views_of
 from tests.nerfstudio.crash_training import gaussians

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 import tyro
 
-from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
-from abcd_ns.cli.export.shown import Box
+from abcd_ns.cli.export import Box, check_request, stored, tell_rounding, to_data
 from abcd_ns.cli.paths import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store.atomic import replacing

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from abcd_ns.cli.export.shown import check_trained
+from abcd_ns.cli.export import check_trained
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures

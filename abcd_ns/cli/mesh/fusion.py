@@ -20,7 +20,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from abcd_ns.cli.export.shown import Box, inside
+from abcd_ns.cli.export import Box, inside
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.space.partition import build_kd

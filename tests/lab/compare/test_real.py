@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from abcd_ns.cli.export.command import export
+from abcd_ns.cli.export import export
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.results.results import CurvePoint
 from tests.lab.compare.records import read_results

@@ -1,1 +1,0 @@
-"""`abcd doctor`: `facts` looks, `command` judges."""
