@@ -123,9 +123,15 @@ def to_data(run: Path) -> Frame:
 
 @contextmanager
 def stored(run: Path) -> Iterator[ParameterStore]:
-    """The blocks of a run; UserError where they cannot be read."""
+    """The blocks of a run; UserError where they cannot be read, or none can be shown yet."""
     try:
         with ParameterStore.open(run / STATE / STORE, read_only=True) as store:
+            state = RunState.from_json(store.state) if store.state else None
+            if state is None or (state.active is not None and state.active.is_whole):
+                raise UserError(
+                    f"{store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
+                    "`ns-export gaussian-splat` on a checkpoint."
+                )
             yield store
     except StoreError as error:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
@@ -135,16 +141,6 @@ def inside(box: Box, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     """Which points lie in the box."""
     low, high = points.new_tensor(box[:3]), points.new_tensor(box[3:])
     return ((points >= low) & (points < high)).all(dim=1)
-
-
-def check_trained(store: ParameterStore) -> None:
-    """Raises UserError where no block of a run can be shown yet."""
-    state = RunState.from_json(store.state) if store.state else None
-    if state is None or (state.active is not None and state.active.is_whole):
-        raise UserError(
-            f"{store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
-            "`ns-export gaussian-splat` on a checkpoint."
-        )
 
 
 @dataclass
@@ -157,7 +153,6 @@ class Shown:
     box: Box | None
 
     def __post_init__(self) -> None:
-        check_trained(self.store)
         self._tree = BlockTree.from_json(self.store.header["tree"])
         self.blocks = range(self._tree.num_blocks)
         self.antialiased: bool = self.store.header.get(MADE_FOR, {}).get("antialiased", False)

@@ -21,8 +21,7 @@ from tests.data.dataparser_scenes import (
     add_mask,
     parser,
     project_pycolmap,
-    write_model,
-    write_photos,
+    write_capture,
     write_transforms,
 )
 
@@ -34,17 +33,12 @@ def wide(width: int, height: int) -> tuple[str, list[float]]:
     return "PINHOLE", [width * 0.3, width * 0.3, width / 2, height / 2]
 
 
-def write_sound(folder: Path) -> Path:
-    """Nothing about it is doubtful; its photos have two sizes."""
-    write_model(folder / "sparse/0", points=POINTS, params=wide)
-    write_photos(folder / "images")
-    return folder
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
-    """Not to be written to."""
-    return write_sound(tmp_path_factory.mktemp("check") / "scene")
+    """Nothing about it is doubtful; its photos have two sizes. Not to be written to."""
+    folder = tmp_path_factory.mktemp("sound")
+    write_capture(folder, points=POINTS, params=wide)
+    return folder
 
 
 @pytest.fixture
@@ -53,7 +47,7 @@ def scene(sound, tmp_path) -> Path:
     return Path(shutil.copytree(sound, tmp_path / "scene"))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def found(sound) -> Survey:
     return survey(sound, 1)
 
@@ -85,8 +79,7 @@ def test_a_sound_scene_is_summed_up(sound, found, capsys):
 
 
 def test_points_in_view_are_those_that_pycolmap_projects_into_it(tmp_path):
-    model = write_model(tmp_path / "sparse/0", points=300)
-    write_photos(tmp_path / "images")
+    model = write_capture(tmp_path, points=300)
     seen = visibility(parser(tmp_path).prepared())
     for row, name in enumerate(sorted(NAMES)):
         width, height = SIZES[NAMES.index(name) % 2]
@@ -144,8 +137,7 @@ def test_names_that_no_terminal_takes_are_escaped(scene, capsys):
 
 
 def test_the_readers_notes_are_warnings(tmp_path):
-    write_model(tmp_path / "sparse/0", points=0)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, points=0)
     for i in range(11):
         Image.new("RGB", (9, 9), (i, 90, 90)).save(tmp_path / f"images/extra{i}.png")
     said = [finding.what for finding in examine(tmp_path)[1] if finding.name == "input"]
@@ -186,8 +178,7 @@ def with_brightness(found: Survey, *brightness: float) -> Survey:
 
 
 def test_few_photos_and_a_split_that_leaves_one(tmp_path):
-    write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2], params=wide)
-    write_photos(tmp_path / "images", names=NAMES[:2])
+    write_capture(tmp_path, NAMES[:2], points=POINTS, params=wide)
     (few,) = (finding for finding in examine(tmp_path)[1] if finding.name == "few-photos")
     assert "2 photos, 1 of them to train on" in few.what
     assert "eval-mode all" in few.fix

@@ -21,7 +21,7 @@ from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.run.fit import FITTED, Fit, blocks_to_begin_with
 from abcd_ns.units import GIB
 from tests.cli.test_check import wide
-from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
+from tests.data.dataparser_scenes import NAMES, parser, write_capture
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FULL = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000)
@@ -109,8 +109,7 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
 
 @pytest.mark.parametrize(("photos", "points"), [(2, 600), (4, 0)])
 def test_plan_and_check_take_what_training_takes(tmp_path, capsys, photos, points):
-    write_model(tmp_path / "sparse/0", points=points, names=NAMES[:photos], params=wide)
-    write_photos(tmp_path / "images", names=NAMES[:photos])
+    write_capture(tmp_path, NAMES[:photos], points=points, params=wide)
     assert inspect(parser(tmp_path).config).train == photos - 1
     assert check(data=tmp_path) == 0
     assert plan(tmp_path, Wanted(max_gaussians=100, steps=10)) == 0

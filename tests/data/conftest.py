@@ -2,12 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.data.dataparser_scenes import write_model, write_photos
+from tests.data.dataparser_scenes import write_capture
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     """A small sound scene, COLMAP binary."""
-    write_model(tmp_path / "scene/sparse/0")
-    write_photos(tmp_path / "scene/images")
+    write_capture(tmp_path / "scene")
     return tmp_path / "scene"

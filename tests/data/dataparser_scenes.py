@@ -65,9 +65,11 @@ def write_photos(folder: Path, names: list[str] = NAMES, divide: float = 1, roun
         Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(folder / name)
 
 
-def write_capture(folder: Path, names: list[str] = NAMES, **options) -> pycolmap.Reconstruction:
-    """A model and its photos, where they are looked for."""
-    write_photos(folder / "images", names)
+def write_capture(
+    folder: Path, names: list[str] = NAMES, photos: list[str] | None = None, divide: float = 1, **options
+) -> pycolmap.Reconstruction:
+    """A model and its photos, which may be called otherwise, where they are looked for."""
+    write_photos(folder / "images", names if photos is None else photos, divide)
     return write_model(folder / "sparse/0", names=names, **options)
 
 

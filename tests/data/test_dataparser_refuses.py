@@ -24,7 +24,6 @@ from tests.data.dataparser_scenes import (
     save_transforms,
     write_capture,
     write_model,
-    write_photos,
     write_transforms,
 )
 
@@ -88,8 +87,7 @@ def test_a_model_that_lacks_a_file_is_named_with_it(tmp_path, gone):
     ],
 )
 def test_names_that_mean_no_photo_or_two_are_refused(tmp_path, names, photos, message):
-    write_model(tmp_path / "sparse/0", names=names)
-    write_photos(tmp_path / "images", photos)
+    write_capture(tmp_path, names, photos)
     assert message in refusal(tmp_path)
 
 

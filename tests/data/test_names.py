@@ -20,7 +20,6 @@ from tests.data.dataparser_scenes import (
     save_transforms,
     write_capture,
     write_model,
-    write_photos,
     write_transforms,
 )
 
@@ -71,8 +70,7 @@ OTHERWISE = [
 
 @pytest.mark.parametrize("called", OTHERWISE)
 def test_models_of_other_machines_find_their_photos(tmp_path, called, capsys):
-    write_model(tmp_path / "sparse/0", names=[called(name) for name in NAMES])
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, [called(name) for name in NAMES], NAMES)
     (tmp_path / "test_list.txt").write_text(f"{called(NAMES[0])}\n", encoding="utf-8-sig")
     assert paths_of(tmp_path) == IMAGES
     assert re.search(r"10 files have other names \(.*\)", capsys.readouterr().out)
@@ -92,8 +90,7 @@ def test_lists_of_other_machines_find_their_photos(scene, kind, called):
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
 def test_the_form_of_unicode_does_not_matter(tmp_path, forms):
     of_model, of_files = ([unicodedata.normalize(form, f"\u00e4{k}.png") for k in range(4)] for form in forms)
-    write_model(tmp_path / "sparse/0", names=of_model)
-    write_photos(tmp_path / "images", of_files)
+    write_capture(tmp_path, of_model, of_files)
     assert paths_of(tmp_path) == {f"images/{name}" for name in of_files}
 
 
@@ -143,8 +140,7 @@ def test_text_models_as_windows_saves_them(tmp_path):
 
 
 def test_the_model_with_most_photos_is_taken_and_it_is_said(tmp_path, capsys):
-    write_photos(tmp_path / "images")
-    write_model(tmp_path / "sparse/0", names=NAMES[:3])
+    write_capture(tmp_path, NAMES[:3], NAMES)
     write_model(tmp_path / "sparse/1", text=True)
     write_model(tmp_path / "sparse/2", names=NAMES[:4])
     assert paths_of(tmp_path) == IMAGES
@@ -203,8 +199,7 @@ def test_no_cloud_may_be_named_as_none(scene, value):
 
 @pytest.mark.parametrize("divide", [2, 0.5, 1.7])
 def test_photos_that_are_all_one_share_of_their_cameras_are_taken(tmp_path, divide, capsys):
-    write_model(tmp_path / "sparse/0")
-    write_photos(tmp_path / "images", divide=divide)
+    write_capture(tmp_path, divide=divide)
     cameras = parser(tmp_path, eval_mode="all").get_dataparser_outputs().cameras
     for row, name in enumerate(sorted(NAMES)):
         width, height = SIZES[NAMES.index(name) % 2]
@@ -215,8 +210,7 @@ def test_photos_that_are_all_one_share_of_their_cameras_are_taken(tmp_path, divi
 
 def test_a_photo_may_have_the_size_that_another_photos_camera_says(tmp_path, monkeypatch):
     monkeypatch.setattr(dataparser_scenes, "SIZES", ((40, 30), (80, 60)))
-    write_model(tmp_path / "sparse/0")
-    write_photos(tmp_path / "images", divide=2)
+    write_capture(tmp_path, divide=2)
     cameras = parser(tmp_path, eval_mode="all").get_dataparser_outputs().cameras
     assert sorted(set(cameras.width.flatten().tolist())) == [20, 40]
 

@@ -12,7 +12,7 @@ import abcd_ns
 from abcd_ns.cli import export as export_module
 from abcd_ns.errors import UserError
 from abcd_ns.formats import streamed
-from abcd_ns.formats.levels import MOST_OPAQUE, coarser, merged, pairs
+from abcd_ns.formats.streamed import MOST_OPAQUE, coarser, merged, pairs
 from tests.cli.test_export import export, run, scene  # noqa: F401
 from tests.reference.scenes import random_gaussians
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from abcd_ns.cli.mesh.command import mesh
 from abcd_ns.cli.report.command import report
-from abcd_ns.cli.report.figures import training_command
+from abcd_ns.cli.report.page import training_command
 from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.inspection import inspect

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from abcd_ns.cli.export import check_trained
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, default_pass
 from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
@@ -76,7 +75,6 @@ def open_views(
     store: ParameterStore, config: AbcdPipelineConfig
 ) -> tuple[LayerRenderer, RenderSettings, list[View]]:
     """What renders the scene, and its training views, as posed in the data."""
-    check_trained(store)
     mirror(config.training, config.model)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     capture = config.datamanager.setup(device=device, test_mode="test").train_dataset

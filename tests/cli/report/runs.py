@@ -29,17 +29,14 @@ TRAINING = {
     "limit": 1000,
     "budgets": {"photos": 1 << 30, "layers": 4 << 30},
 }
+MADE_UP = {"psnr": 20.0, "held": {}, "block": 0, "compiled_loss": False}
 PIXEL = "data:image/png;base64,AAAA"
 
 
 def line(kind: str, step: int, seconds: float, **fields) -> str:
     """A line of a log; what is not given is made up."""
-    values = {"step": step, "seconds": seconds, **fields}
-    for entry in dataclasses.fields(KINDS[kind]):
-        values.setdefault(
-            entry.name, {"psnr": 20.0, "held": {}, "block": 0, "compiled_loss": False}.get(entry.name, 1)
-        )
-    return json.dumps({"kind": kind, **values})
+    made_up = {entry.name: MADE_UP.get(entry.name, 1) for entry in dataclasses.fields(KINDS[kind])}
+    return json.dumps({"kind": kind, **made_up, "step": step, "seconds": seconds, **fields})
 
 
 def log_lines() -> list[str]:

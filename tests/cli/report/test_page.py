@@ -12,9 +12,15 @@ import pytest
 import torch
 
 from abcd_ns.cli.report.charts import draw_map, draw_progress
-from abcd_ns.cli.report.figures import block_rows, changed_options, more_figures, tiles, training_command
 from abcd_ns.cli.report.held_out import pick
-from abcd_ns.cli.report.page import render_page
+from abcd_ns.cli.report.page import (
+    block_rows,
+    changed_options,
+    more_figures,
+    render_page,
+    tiles,
+    training_command,
+)
 from abcd_ns.cli.report.run_folder import CHECKPOINTS, RunFolder, open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
