@@ -95,8 +95,10 @@ def export(
                 raise UserError(f"{why}. To pack more, use --lod, or .compressed.ply.")
             ram = bytes_in_words(most * BYTES_AT_ONCE)
             print(f"{suffix} is packed at once, in about {ram} of RAM; .ply and .glb are not.")
-        write = _write_levels if lod else _write_parts if by_block else _write
-        written = write(scene, counts, out, suffix)
+        if by_block or lod:
+            written = _write_folder(scene, counts, out, suffix, lod)
+        else:
+            written = _write(scene, counts, out, suffix)
     _report(written, counts, scene, suffix)
     return 0
 
@@ -231,24 +233,16 @@ def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list
     return [out]
 
 
-def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
-    with _new_folder(out):
-        for block in tracked(counts, "writing"):
-            _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
-    return list(out.iterdir())
-
-
-def _write_levels(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:  # noqa: ARG001
-    with _new_folder(out):
-        parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
-        return write_streamed(out, parts, scene.antialiased)
-
-
-@contextmanager
-def _new_folder(out: Path) -> Iterator[None]:
+def _write_folder(scene: Shown, counts: dict[int, int], out: Path, suffix: str, lod: bool) -> list[Path]:
+    """Levels of detail, or a file for each block."""
     out.mkdir()
     try:
-        yield
+        if lod:
+            parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
+            return write_streamed(out, parts, scene.antialiased)
+        for block in tracked(counts, "writing"):
+            _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
+        return list(out.iterdir())
     except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
         raise
