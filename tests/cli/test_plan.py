@@ -16,9 +16,10 @@ from abcd_ns.cli.plan.command import plan
 from abcd_ns.cli.plan.forecast import LOST, Capture, Forecast, forecast, print_forecast
 from abcd_ns.cli.plan.wanted import Wanted
 from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
-from abcd_ns.run.fit import FITTED, Fit, blocks_to_begin_with
+from abcd_ns.run.fit import Fit, blocks_to_begin_with
 from abcd_ns.units import GIB
 from tests.cli.check.scenes import wide
 from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
@@ -59,7 +60,7 @@ def test_a_forecast_adds_up():
 def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
     """As in training, which fits nothing to the device then."""
     found = planned(Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5))
-    assert found.fit.limits == dict.fromkeys(FITTED, 0)
+    assert found.fit.limits == Limits()
     assert "1,500,000 Gaussians" in next(iter(found.shares["device"]))
     assert any("on the device" in line for line in found.warnings)
 
@@ -100,7 +101,7 @@ def test_large_photos_are_planned_for_as_they_are_trained_on(height):
         assert "--pipeline" not in str(refused.value)
         return
     found = planned(Wanted(device_budget_gb=0.15), small)
-    assert 0 < found.fit.crop_pixels < 260_000
+    assert 0 < found.fit.limits.crop_pixels < 260_000
     assert sum(found.shares["device"].values()) <= 0.15 * GIB
     assert not found.warnings
 
@@ -134,12 +135,12 @@ def test_a_scene_of_which_views_see_little_is_cut_in_two_if_there_is_room():
     little = planned(Wanted(), dataclasses.replace(capture(), seen=0.05))
     assert (little.fit.blocks, little.batch) == (2, 4)
     assert planned(Wanted(blocks=1), dataclasses.replace(capture(), seen=0.05)).fit.blocks == 1
-    full = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000)
+    full = Fit(1, GIB, 1000, Limits(sole_limit=5000))
     assert blocks_to_begin_with(full, 0, 0.05) == 1
 
 
 def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
-    full = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000)
+    full = Fit(1, GIB, 1000, Limits(sole_limit=5000))
     with pytest.raises(UserError, match=r"1\.0 GiB of the device have no room for a block among others"):
         blocks_to_begin_with(full, 2, 1.0)
     alone, found = (planned(Wanted(max_gaussians=600, workers=n)) for n in (1, 3))
