@@ -170,7 +170,7 @@ def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
 
 
 def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
-    trained, rendered, monkeypatch, capsys
+    trained, rendered, monkeypatch, said_at_exit
 ):
     _, pipeline, _, _ = eval_setup(trained / "config.yml")
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
@@ -182,21 +182,16 @@ def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
     monkeypatch.setattr(
         "sys.argv", ["ns-render", "camera-path", "--load-config", str(trained / "config.yml")]
     )
-    with pytest.raises(SystemExit):
-        rendered(["rgb"], camera_type="fisheye")
-    assert "error: Camera 0 is fisheye" in capsys.readouterr().out
+    assert "error: Camera 0 is fisheye" in said_at_exit(rendered, ["rgb"], camera_type="fisheye")
 
 
-def test_a_box_without_gaussians_ends_an_export_in_one_line(trained, monkeypatch, capsys):
+def test_a_box_without_gaussians_ends_an_export_in_one_line(trained, monkeypatch, said_at_exit):
     box = ["--obb_center", "9", "9", "9", "--obb-rotation", "0", "0", "0", "--obb_scale"]
     words = ["ns-export", "gaussian-splat", "--load-config", str(trained / "config.yml"), *box]
     monkeypatch.setattr("sys.argv", [*words, "99", "99", "99"])
     eval_setup(trained / "config.yml")
     monkeypatch.setattr("sys.argv", [*words, "0.1", "0.1", "0.1"])
-    with pytest.raises(SystemExit) as ended:
-        eval_setup(trained / "config.yml")
-    assert ended.value.code == 2
-    assert "error: No Gaussian lies in this box" in capsys.readouterr().out
+    assert "error: No Gaussian lies in this box" in said_at_exit(eval_setup, trained / "config.yml")
 
 
 def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
@@ -209,20 +204,18 @@ def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
     assert torch.equal(model.shs_0, gaussians.features_dc)
 
 
-def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, capsys):
+def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, said_at_exit):
     moved = shutil.copytree(trained, tmp_path / "renamed")
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(moved / "config.yml")])
     _, _, checkpoint, _ = eval_setup(moved / "config.yml")
     assert checkpoint.parent == moved / "nerfstudio_models"
     checkpoint.unlink()
-    with pytest.raises(SystemExit):
-        eval_setup(moved / "config.yml")
-    assert f"{checkpoint.parent} has no checkpoint" in capsys.readouterr().out
+    assert f"{checkpoint.parent} has no checkpoint" in said_at_exit(eval_setup, moved / "config.yml")
 
 
 @pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])
 def test_what_a_user_can_repair_ends_a_tool_in_one_line(
-    data, trained, tmp_path, capsys, monkeypatch, moved, words
+    data, trained, tmp_path, monkeypatch, said_at_exit, moved, words
 ):
     scene = tmp_path / "elsewhere"
     if moved == "photos":
@@ -233,11 +226,7 @@ def test_what_a_user_can_repair_ends_a_tool_in_one_line(
     folder = Path(shutil.copytree(trained, tmp_path / "run"))
     (folder / "config.yml").write_text(yaml.dump(config))
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(folder / "config.yml")])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as ended:
-        evaluated(folder, tmp_path)
-    assert ended.value.code == 2
-    said = capsys.readouterr().out
+    said = said_at_exit(evaluated, folder, tmp_path)
     assert "error:" in said
     assert words in said
 
