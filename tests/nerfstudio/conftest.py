@@ -3,6 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import write_scene
 
 
@@ -10,6 +12,12 @@ from tests.reference.colmap_scene import write_scene
 def data(tmp_path_factory) -> Path:
     """The folder of a tiny scene. Read only."""
     return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="session")
+def trained(data, tmp_path_factory) -> AbcdTrainer:
+    """A run that nothing disturbed. Read only."""
+    return run(configure(data, tmp_path_factory.mktemp("out")))
 
 
 @pytest.fixture

@@ -8,16 +8,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.nerfstudio.model import AbcdModel
-from abcd_ns.nerfstudio.trainer import AbcdTrainer
-from tests.nerfstudio.test_training import configure, run
 
 CLOSE = 5e-4
 """Drawing stops where 1e-4 of the light is left, and a node knows nothing of the others."""
-
-
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory) -> AbcdTrainer:
-    return run(configure(data, tmp_path_factory.mktemp("out"), steps=12))
 
 
 @pytest.fixture

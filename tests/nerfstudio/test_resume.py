@@ -24,12 +24,6 @@ from tests.reference.scenes import ring_of_views
 
 
 @pytest.fixture(scope="module")
-def undisturbed(data, tmp_path_factory) -> Path:
-    """The folder of a run that nothing disturbed. Read only."""
-    return run(configure(data, tmp_path_factory.mktemp("out"))).base_dir
-
-
-@pytest.fixture(scope="module")
 def trainings() -> Trainings:
     return Trainings()
 
@@ -75,7 +69,7 @@ def refusal(said_at_exit) -> Callable[..., str]:
 # Kills
 
 
-def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, undisturbed, tmp_path):
+def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, trained, tmp_path):
     killed_at = STEPS_PER_SAVE
     options = {"kill_at_step": killed_at, "commit_seconds": 0.0}
     assert trainings.finish(data, tmp_path / "killed", **options) == -signal.SIGKILL
@@ -83,14 +77,14 @@ def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, dat
     assert not list(killed.rglob("*.ckpt"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=killed / "nerfstudio_models"))
     assert 0 < resumed.resumed_from.step <= killed_at
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
 @pytest.mark.parametrize(
     "point",
     [crash_points.CHECKPOINT_PINNED, crash_points.CHECKPOINT_WRITTEN, crash_points.CHECKPOINT_IN_PLACE],
 )
-def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbed, tmp_path, point):
+def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, trained, tmp_path, point):
     assert trainings.finish(data, tmp_path / "killed", kill=Kill(point, 2)) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")
     files = [path.name for path in (killed / "nerfstudio_models").iterdir()]
@@ -99,21 +93,21 @@ def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbe
     resumed = run(configure(data, tmp_path / "killed", load_dir=killed))  # in the same folder
     assert resumed.base_dir == killed
     assert resumed.resumed_from.step == 2 * STEPS_PER_SAVE + 1
-    assert_same(killed, undisturbed)
+    assert_same(killed, trained.base_dir)
     assert len(list((killed / "nerfstudio_models").iterdir())) == 1
     assert not list(killed.glob(".*"))
 
 
-def test_an_older_checkpoint_can_be_asked_for(data, stopped, undisturbed, tmp_path):
+def test_an_older_checkpoint_can_be_asked_for(data, stopped, trained, tmp_path):
     resumed = run(configure(data, tmp_path / "b", load_dir=stopped, load_step=STEPS_PER_SAVE))
     assert (resumed.resumed_from.step, resumed.resumed_from.pin) == (STEPS_PER_SAVE + 1, "step-000000010")
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
     checkpoint = stopped / "nerfstudio_models" / "step-000000010.ckpt"
     again = run(configure(data, tmp_path / "c", load_checkpoint=checkpoint, steps=STEPS_PER_SAVE + 2))
     assert again.pipeline.coordinator.state.step == STEPS_PER_SAVE + 2
 
 
-def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_path, undisturbed):
+def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_path, trained):
     """ns-eval would open these, and not what the run has come to since."""
     options = {"save_only_latest_checkpoint": False}
     folder = run(configure(data, tmp_path, **options), stop_after=34).base_dir
@@ -123,7 +117,7 @@ def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_pat
     resumed = run(configure(data, tmp_path, load_dir=folder, **options))
     assert resumed.resumed_from.step < 20
     assert saved(folder) == [10, 20, 30, STEPS - 1]
-    assert_same(folder, undisturbed)
+    assert_same(folder, trained.base_dir)
 
 
 def saved(folder: Path) -> list[int]:
@@ -138,7 +132,7 @@ def saved(folder: Path) -> list[int]:
 
 @pytest.mark.parametrize(("number", "event"), [(signal.SIGINT, StepTaken), (signal.SIGTERM, LayersDrawn)])
 def test_a_signal_commits_and_says_how_to_go_on(
-    data, undisturbed, tmp_path, monkeypatch, said_at_exit, number, event
+    data, trained, tmp_path, monkeypatch, said_at_exit, number, event
 ):
     config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
@@ -160,7 +154,7 @@ def test_a_signal_commits_and_says_how_to_go_on(
     assert taken == 17 or event is LayersDrawn
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
     assert resumed.resumed_from.step == taken
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
 def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, monkeypatch, said_at_exit):
@@ -221,7 +215,7 @@ def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path
 
 
 def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
-    data, undisturbed, tmp_path, monkeypatch, said_at_exit
+    data, trained, tmp_path, monkeypatch, said_at_exit
 ):
     def full(_, path):
         Path(path).write_bytes(b"half")
@@ -236,10 +230,10 @@ def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
     assert not list(folder.glob(".*"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
     assert resumed.resumed_from.step == STEPS_PER_SAVE + 1
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
-def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stopped, undisturbed, tmp_path):
+def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stopped, trained, tmp_path):
     (checkpoint,) = (stopped / "nerfstudio_models").iterdir()
     means = gaussians(stopped)["_model.gauss_params.means"].numpy().tobytes()
     sound = checkpoint.read_bytes()
@@ -256,7 +250,7 @@ def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stoppe
             eval_setup(stopped / "config.yml", update_config_callback=moved)
     checkpoint.write_bytes(sound[: len(sound) // 2])
     resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped))
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
 # What cannot be resumed

@@ -94,11 +94,6 @@ def run(
     return trainer
 
 
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory) -> AbcdTrainer:
-    return run(configure(data, tmp_path_factory.mktemp("out")))
-
-
 @pytest.mark.parametrize("end", [RuntimeError, Stopped])
 def test_workers_end_with_their_run_and_visits_are_saved_where_it_is_stopped(data, tmp_path, end):
     """Once at once, since whoever stops it may not wait, and once with the visits under way."""
