@@ -69,7 +69,7 @@ def describe_machine() -> Machine:
     import torch
 
     return Machine(
-        cpu=_cpu_model(),
+        cpu=_proc_value("cpuinfo", "model name") or platform.processor() or platform.machine(),
         cores=usable_cores(),
         torch_threads=threads_wanted(),
         ram_bytes=psutil.virtual_memory().total,
@@ -100,12 +100,9 @@ def without_home(text: str) -> str:
 
 def peak_rss_bytes() -> int:
     """The most RAM that this process has held so far."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # Not getrusage: on Linux its ru_maxrss starts from the parent's peak, across fork and exec.
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024  # in kB, which means KiB here
+    # Not getrusage: on Linux its ru_maxrss starts from the parent's peak, across fork and exec.
+    if (in_kib := _proc_value("self/status", "VmHWM")) is not None:
+        return int(in_kib.removesuffix("kB")) * 1024
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -128,13 +125,11 @@ def disk_bytes(folder: Path) -> int:
     return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())
 
 
-def _cpu_model() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+def _proc_value(file: str, name: str) -> str | None:
+    """The first value of that name in a file of Linux' /proc; None on other systems."""
+    path = Path("/proc", file)
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), None)
 
 
 def package_version(package: str) -> str | None:

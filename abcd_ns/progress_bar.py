@@ -27,26 +27,22 @@ class ProgressBar:
         self._progress = Progress(console=console, transient=True, disable=not console.is_terminal)
         self._task = self._progress.add_task(title, total=total)
         self._start = time.monotonic()
-        self._shown = False
 
     def __enter__(self) -> "ProgressBar":
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._shown:
+        if self._progress.live.is_started:
             self._progress.stop()
 
     def advance(self) -> None:
         """One more is done."""
         self._progress.advance(self._task)
-        if not self._shown and time.monotonic() - self._start > APPEARS_AFTER:
+        if not self._progress.live.is_started and time.monotonic() - self._start > APPEARS_AFTER:
             self._progress.start()
-            self._shown = True
 
 
-def tracked(
-    items: Iterable[T], title: str, total: int | None = None, console: Console | None = None
-) -> Iterator[T]:
+def tracked(items: Iterable[T], title: str, total: int | None = None) -> Iterator[T]:
     """The items one by one, each of them some work, with a `ProgressBar`.
 
     Args:
@@ -54,7 +50,7 @@ def tracked(
     """
     if total is None and isinstance(items, Collection):
         total = len(items)
-    with ProgressBar(title, total or 0, console) as bar:
+    with ProgressBar(title, total or 0) as bar:
         for item in items:
             yield item
             bar.advance()

@@ -81,12 +81,8 @@ class AbcdDataParser(DataParser):
                 options = replace(options, downscale_factor=1)
             self._prepared = prepare(options, needs_photos=self.downscale_factor is None)
             for note in (*self._prepared.chosen, *self._prepared.notes):
-                self.tell(note)
+                say(one_line(note), "yellow")
         return self._prepared
-
-    def tell(self, note: str) -> None:
-        """Say what the user should know but need not repair."""
-        say(one_line(note), "yellow")
 
     def rows(self, split: str) -> list[int]:
         """Rows of the prepared scene's lists that belong to a split; see `split_rows`."""

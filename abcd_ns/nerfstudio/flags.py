@@ -20,7 +20,6 @@ from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
 
 METHODS = "abcd"  # start of the names of all our methods
-LOAD_CONFIG = ("--load-config", "--load_config")
 UNUSED_OF_VIEWER = {
     "num_rays_per_chunk": "it is about rays, and Gaussians are not drawn by rays",
     "relative_log_filename": "the viewer writes no log",
@@ -38,14 +37,14 @@ def trains_ours(words: Sequence[str]) -> bool:
 
 def opened(words: Sequence[str]) -> Path | None:
     """The config.yml that ns-eval, ns-viewer, ns-render or ns-export opens; None for other commands."""
-    path = _value(words, "--load-config")
+    path = value_of(words, "--load-config")
     tool = Path(words[0]).stem
     return Path(path) if path and tool.startswith("ns-") and tool != "ns-train" else None
 
 
 def check_config(words: Sequence[str]) -> None:
     """Raise a UserError if the config.yml of ours that a command line names is none."""
-    name = _value(words, "--load-config")
+    name = value_of(words, "--load-config")
     path = Path(name or "")
     meant = path / "config.yml" if path.is_dir() else path
     if not name or not (trains_ours(words) or opens_ours([words[0], "--load-config", str(meant)])):
@@ -59,7 +58,7 @@ def check_config(words: Sequence[str]) -> None:
     else:
         if root is not None and root.tag.startswith("tag:yaml.org,2002:python/object"):
             flags = [word for word in words[2:] if word.startswith("--")]
-            beside = [flag for flag in flags if not flag.startswith(LOAD_CONFIG)]
+            beside = [flag for flag in flags if not flag.startswith(("--load-config", "--load_config"))]
             if beside and trains_ours(words):
                 why = "takes all options from its file, and none beside it"
                 raise UserError(f"--load-config {why}: write {beside[0]} into {path}, or leave it out.")
@@ -89,18 +88,18 @@ def check_tool(words: Sequence[str]) -> None:
         raise UserError(f"ns-export {what} cannot draw Gaussians; `abcd mesh {config.parent}` makes a mesh.")
     if tool == "ns-render" and what == "spiral":
         raise UserError("ns-render spiral is for methods that train on rays: use ns-render interpolate.")
-    out = _value(words, "--output-path")
+    out = value_of(words, "--output-path")
     if tool == "ns-eval" and out and not out.endswith(".json"):
         raise UserError(f"--output-path {out} must end in .json.")
     folders = [Path(out).parent] if out else []
-    given = (_value(words, flag) for flag in ("--output-dir", "--render-output-path"))
+    given = (value_of(words, flag) for flag in ("--output-dir", "--render-output-path"))
     folders += [Path(folder) for folder in given if folder]
     for folder in folders:  # the tools end with a traceback, ns-eval after all its work
         there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
         if not there.is_dir() or not os.access(there, os.W_OK):
             why = "is read-only" if there.is_dir() else "is a file"
             raise UserError(f"{folder} cannot be made, {there} {why}: choose another folder.")
-    if (path := _value(words, "--camera-path-filename")) is not None:
+    if (path := value_of(words, "--camera-path-filename")) is not None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -115,21 +114,21 @@ def check_held_out(words: Sequence[str], held_out: int = 0) -> None:
     if tool == "ns-eval" and not held_out:
         raise UserError("This run's data holds no photos out, so there is nothing to score.")
     too_few = what == "interpolate" or not held_out
-    if tool == "ns-render" and flag and too_few and _value(words, flag) != "train":
+    if tool == "ns-render" and flag and too_few and value_of(words, flag) != "train":
         found = "one photo" if held_out else "no photos"
         raise UserError(f"This run's data holds {found} out: add {flag} train.")
 
 
 def check_box(words: Sequence[str], means: Float[Tensor, "n 3"]) -> None:
     """Raise a UserError if the box of `ns-export gaussian-splat` holds none of the means."""
-    given = [_value(words, f"--obb-{name}", 3) for name in ("center", "rotation", "scale")]
+    given = [value_of(words, f"--obb-{name}", 3) for name in ("center", "rotation", "scale")]
     if Path(words[0]).stem == "ns-export" and None not in given:
         box = OrientedBox.from_params(*(tuple(map(float, values.split())) for values in given))
         if not box.within(means.detach().cpu()).any():
             raise UserError("No Gaussian lies in this box: move it, or make it larger.")
 
 
-def _value(words: Sequence[str], flag: str, count: int = 1) -> str | None:
+def value_of(words: Sequence[str], flag: str, count: int = 1) -> str | None:
     """The `count` words that follow a flag on a command line; None without the flag."""
     flags = [word.partition("=")[0].replace("_", "-") for word in words]
     if flag not in flags:
@@ -140,12 +139,7 @@ def _value(words: Sequence[str], flag: str, count: int = 1) -> str | None:
 
 def hidden(*names: str) -> Callable[[type], type]:
     """Class decorator above `@dataclass`: these fields are no flags; files and Python may set them."""
-
-    def decorate(cls: type) -> type:
-        hints = get_type_hints(cls, include_extras=True)
-        return _annotate(cls, {name: tyro.conf.Suppress[hints[name]] for name in names})
-
-    return decorate
+    return lambda cls: annotated(cls, dict.fromkeys(names, tyro.conf.Suppress))
 
 
 def shown(*names: str) -> Callable[[type], type]:
@@ -164,16 +158,11 @@ def shown(*names: str) -> Callable[[type], type]:
     return decorate
 
 
-def named_too(cls: type, flags: Mapping[str, str]) -> None:
-    """Give fields of a config class, by name, a second flag each."""
+def annotated(cls: type, marks: Mapping[str, Any]) -> type:
+    """The config class, its fields marked by name; tyro reads that when it makes its command line."""
     hints = get_type_hints(cls, include_extras=True)
-    second = {name: tyro.conf.arg(aliases=[flag]) for name, flag in flags.items()}
-    _annotate(cls, {name: Annotated[hints[name], also] for name, also in second.items()})
-
-
-def _annotate(cls: type, annotations: dict[str, Any]) -> type:
-    # tyro reads annotations when it makes its command line.
-    cls.__annotations__ = {**cls.__annotations__, **annotations}
+    marked = {name: Annotated[hints[name], mark] for name, mark in marks.items()}
+    cls.__annotations__ = {**cls.__annotations__, **marked}
     return cls
 
 

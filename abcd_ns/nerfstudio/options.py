@@ -20,7 +20,7 @@ from abcd_ns.engine.train.schedule import DECAY_VIEWS
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
-from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, UNUSED_OF_VIEWER, hidden, named_too, shown
+from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, UNUSED_OF_VIEWER, annotated, hidden, shown
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
 from abcd_ns.run.options import check_not_below_0
@@ -53,7 +53,8 @@ _first = ("primitive", "sh_degree", "background", "light", "poses", "antialiased
 shown(*_first)(hidden("seed")(TrainingConfig))
 shown("strategy", "max_gaussians", "min_contribution", "split_pixels")(DensityConfig)
 for _config, _flags in SAME.items():
-    named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
+    _marks = {name: tyro.conf.arg(aliases=[f"--pipeline.model.{flag}"]) for name, flag in _flags.items()}
+    annotated(_config, _marks)
 
 _SPLITS = "each that grows becomes two, large or small"
 _ERROR = "set --pipeline.training.density.split-pixels instead: Gaussians grow by error, not by gradients"
@@ -116,15 +117,13 @@ HIDDEN = tuple(
     if option.name not in HONOURED and not option.name.startswith("_")
 )
 """Options of splatfacto's model that have no effect, or are set under other names."""
-NOT_BELOW_0 = ("model.num_random", "model.random_scale", "datamanager.photo_cache_gb")
 
 
 def check_options(config: TrainerConfig) -> None:
     """Raise a UserError if an option is out of range or has no effect, or two contradict each other."""
     pipeline = config.pipeline
     pipeline.check_ranges()
-    for name in NOT_BELOW_0:
-        check_not_below_0(pipeline, name)
+    check_not_below_0(pipeline, ("model.num_random", "model.random_scale", "datamanager.photo_cache_gb"))
     if config.max_num_iterations < 1:
         raise UserError(f"--max-num-iterations must be 1 or more, not {config.max_num_iterations}.")
     if config.is_viewer_legacy_enabled():

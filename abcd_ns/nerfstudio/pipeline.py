@@ -29,7 +29,7 @@ from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.run_log import keep_log
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
 from abcd_ns.nerfstudio.run.settings import write_settings
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import ray_workers
@@ -93,8 +93,9 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
         write_settings(trainer.config, trainer.asked, trainer.folder)
+        earlier = trainer.resumed_from and trainer.resumed_from.store.parent / LOG_FILE
         photos = self.datamanager.train_dataset.photos
-        log = keep_log(self.coordinator, photos, trainer.folder, trainer.resumed_from)
+        log = RunLog(self.coordinator, photos, trainer.folder / LOG_FILE, earlier)
         report = ProgressReport(self.coordinator, log.visits)
         self.coordinator.announce.subscribe(report)
         self.coordinator.announce.subscribe(log)

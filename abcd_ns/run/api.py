@@ -77,7 +77,8 @@ def train(
     options, folder = options or RunOptions(), Path(out) / STATE / STORE
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     training, (places, colors) = options.training, map(torch.as_tensor, points)
-    _check(views, photos, steps, options, device, folder)
+    _check_run(steps, options, device, folder)
+    _check_views(views, photos)
     _check_points(places, colors)
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
     views = as_trained(views, places, options.near_plane)
@@ -143,40 +144,33 @@ def _check_points(places: Tensor, colors: Tensor) -> None:
         raise UserError("No point is finite: give points in the world space of the views.")
 
 
-def _check_view(label: str, view: View, photo: Tensor) -> None:
-    if tuple(photo.shape) != (view.height, view.width, 3):
-        wanted, shape = [view.height, view.width, 3], list(photo.shape)
-        raise UserError(f"Photo {label} has shape {shape}, but its view has {wanted}.")
-    if photo.dtype != torch.uint8:
-        least, most = map(float, photo.float().aminmax())
-        low, high = REAL if photo.is_floating_point() else INTEGER
-        if not low <= least <= most <= high:
-            right = "give integers 0..255, or real numbers 0..1"
-            raise UserError(f"Photo {label} has values from {least:g} to {most:g}: {right}.")
-    turn, side = view.viewmat[:3, :3].double(), max(view.width, view.height)
-    is_rigid = float((turn @ turn.T - torch.eye(3).to(turn)).abs().max()) <= MOST_STRETCH
-    if not (is_rigid and view.viewmat.isfinite().all()):
-        raise UserError(f"View {label} has a viewmat that is no rotation and translation: repair it.")
-    if not all(side / 50 < focal < side * 1000 for focal in view.K.diagonal()[:2].tolist()):
-        raise UserError(f"View {label} has a focal length that no camera has: K must be in pixels.")
+def _check_views(views: Sequence[View], photos: Sequence[Photo]) -> None:
+    if len(views) != len(photos) or not views:
+        raise UserError(f"There are {len(views)} views and {len(photos)} photos: give a photo for each view.")
+    for index, view in enumerate(views):
+        photo = torch.as_tensor(photos[index])
+        if tuple(photo.shape) != (view.height, view.width, 3):
+            wanted, shape = [view.height, view.width, 3], list(photo.shape)
+            raise UserError(f"Photo {index} has shape {shape}, but its view has {wanted}.")
+        if photo.dtype != torch.uint8:
+            least, most = map(float, photo.float().aminmax())
+            low, high = REAL if photo.is_floating_point() else INTEGER
+            if not low <= least <= most <= high:
+                right = "give integers 0..255, or real numbers 0..1"
+                raise UserError(f"Photo {index} has values from {least:g} to {most:g}: {right}.")
+        turn, side = view.viewmat[:3, :3].double(), max(view.width, view.height)
+        is_rigid = float((turn @ turn.T - torch.eye(3).to(turn)).abs().max()) <= MOST_STRETCH
+        if not (is_rigid and view.viewmat.isfinite().all()):
+            raise UserError(f"View {index} has a viewmat that is no rotation and translation: repair it.")
+        if not all(side / 50 < focal < side * 1000 for focal in view.K.diagonal()[:2].tolist()):
+            raise UserError(f"View {index} has a focal length that no camera has: K must be in pixels.")
 
 
-def _check(
-    views: Sequence[View],
-    photos: Sequence[Photo],
-    steps: int,
-    options: RunOptions,
-    device: torch.device,
-    folder: Path,
-) -> None:
+def _check_run(steps: int, options: RunOptions, device: torch.device, folder: Path) -> None:
     options.check_ranges()
     if steps < 1:
         raise UserError(f"steps must be at least 1, not {steps}.")
     if manifest_path(folder).exists():
         raise UserError(f"{folder} holds a run already: choose another folder for `out`.")
-    if len(views) != len(photos) or not views:
-        raise UserError(f"There are {len(views)} views and {len(photos)} photos: give a photo for each view.")
-    for index, view in enumerate(views):
-        _check_view(str(index), view, torch.as_tensor(photos[index]))
     if options.cluster is not None or (options.workers > 1 and not can_fork(device)):
         raise UserError("Workers on GPUs or a cluster need ns-train: leave out workers and cluster.")

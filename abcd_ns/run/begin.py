@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -27,6 +27,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_stored
 from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size, limits_at
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -37,7 +38,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from abcd_ns.run import fit
-from abcd_ns.run.fit import COARSE_MODEL, FITTED, RamShares
+from abcd_ns.run.fit import RamShares
 from abcd_ns.run.options import RunOptions
 from abcd_ns.run.store import ASKED, MEMORY, MadeFor, Start, take_over
 
@@ -114,15 +115,16 @@ def begin_run(
         undo.callback(store.close)
         tree = BlockTree.from_json(store.header["tree"])
         scene = StoredScene(tree, store, RamShares.of(options.ram_budget_gb).blocks)
-        fitted = {name: store.header.get(name, 0) for name in (*FITTED, COARSE_MODEL)}
+        limits = Limits(**{field.name: store.header.get(field.name, 0) for field in fields(Limits)})
         asked = _memory_asked(options)
         if start is not None and any(asked) and asked != store.header.get(MEMORY):
             # It resumes with another budget; else it keeps the limits of the last.
             there, blocks = sum(map(store.counts, range(tree.num_blocks))), tree.num_blocks
             photos = capture.pixels, capture.factor
-            fitted |= fit.fit_run(options, device_bytes, *photos, there, on_cpu, blocks).limits
-            store.commit({}, header={**store.header, **fitted, MEMORY: asked})
-        training = replace(training, limits=replace(training.limits, **fitted))
+            found = fit.fit_run(options, device_bytes, *photos, there, on_cpu, blocks).limits
+            limits = replace(found, coarse_gaussians=limits.coarse_gaussians)
+            store.commit({}, header={**store.header, **asdict(limits), MEMORY: asked})
+        training = replace(training, limits=limits)
         if start is not None:
             state = RunState.from_json(store.state)
             cut_stored(scene, state, limits_at(training, state.sh_degree))
@@ -171,12 +173,12 @@ def _new_store(
     """The store of a run that begins, with all blocks."""
     training = options.training
     cloud = _first_cloud(capture, training, say)
-    blocks, fitted = options.blocks, {name: getattr(training.limits, name) for name in FITTED}
+    blocks, limits = options.blocks, training.limits
     if blocks == 0:
         allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), on_cpu)
         workers = options.workers if fit.has_workers(options) else 0
         seen = mean_share_seen(capture.views, cloud.means) if capture.points else 1.0
-        blocks, fitted = fit.blocks_to_begin_with(allowed, workers, seen), allowed.limits
+        blocks, limits = fit.blocks_to_begin_with(allowed, workers, seen), allowed.limits
         say(replace(allowed, blocks=blocks).in_words())
         if blocks > allowed.blocks and not workers:
             say(f"A view sees {seen:.0%} of the points: two blocks learn more in as much time than one.")
@@ -184,10 +186,10 @@ def _new_store(
         tree = build_kd(cloud.means, blocks)
     else:
         tree = build_grid(cloud.means, counts=grid_counts(cloud.means, blocks))
-    keep = _coarse_model_size(options, capture, len(cloud), tree.num_blocks, fitted)
-    header = {"tree": tree.to_json(), **fitted, COARSE_MODEL: keep or 0, ASKED: options.blocks}
-    header[MEMORY] = _memory_asked(options)
-    store = ParameterStore.create(folder, {**header, **made_for.header()})
+    keep = _coarse_model_size(options, capture, len(cloud), tree.num_blocks, limits)
+    kept = asdict(replace(limits, coarse_gaussians=keep or 0)) | made_for.header()
+    asked = {ASKED: options.blocks, MEMORY: _memory_asked(options)}
+    store = ParameterStore.create(folder, {"tree": tree.to_json(), **kept, **asked})
     if training.recipe.overlap > 0:
         content = independent_blocks(tree, cloud)
     else:
@@ -203,7 +205,7 @@ def _memory_asked(options: RunOptions) -> list[float]:
 
 
 def _coarse_model_size(
-    options: RunOptions, capture: Capture, gaussians: int, blocks: int, fitted: dict[str, int]
+    options: RunOptions, capture: Capture, gaussians: int, blocks: int, limits: Limits
 ) -> int | None:
     """Gaussians that the warm-up may have; None where there is no warm-up."""
     training = options.training
@@ -211,8 +213,7 @@ def _coarse_model_size(
         return None
     # Blocks grow to hold as many Gaussians as there were points, and so may the coarse model.
     grown = max(min(capture.points, training.density.limit or capture.points), gaussians)
-    largest = fitted["block_limit"] or -(-grown // blocks)
-    training = replace(training, limits=replace(training.limits, **fitted))
+    largest, training = limits.block_limit or -(-grown // blocks), replace(training, limits=limits)
     return coarse_model_size(training, largest, 0 if options.gaussian_bytes else capture.pixels)
 
 

@@ -12,9 +12,8 @@ from abcd_ns.cluster.forked_workers import can_fork
 from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.layers.layer_renderer import LEAST_PASS
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, free_on_gpu, levels_of
-from abcd_ns.engine.train.recipe import FULL, Recipe
-from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.train.memory import PHOTO_SHARE, DeviceNeeds, free_on_gpu, levels_of, needs_of
+from abcd_ns.engine.train.recipe import FULL, Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.machine import threads_wanted
 from abcd_ns.run.options import RunOptions
@@ -28,9 +27,6 @@ FEW = 4  # blocks: each step trains one, so where there would be more, fewer har
 PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000  # pixels: smaller parts of a view are mostly border
-FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels", "pass_gaussians", "late_harmonics")
-"""The limits that follow from the device's memory; a run keeps them."""
-COARSE_MODEL = "coarse_gaussians"  # a limit that is kept likewise, on the coarse model
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one stored."""
 LITTLE = 0.1
@@ -44,47 +40,34 @@ class Fit:
 
     blocks: int
     """To begin with: as few as hold the initial Gaussians."""
-    limit: int
-    """Gaussians in a block at most, where there are several; 0 where there is no room for several."""
-    sole: int
-    """Gaussians at most in a block that is the whole scene."""
     budget: int
     """Bytes of the device that training may take."""
     gaussians: int
     """Expected in the whole scene at the end."""
-    crop_pixels: int = 0
-    batch: int = 1
-    pass_gaussians: int = 0
-    late_harmonics: int = 0
-    """These four: see Limits."""
+    limits: Limits
+    """What a run keeps to. `block_limit` is 0 where there is no room for several blocks."""
 
     @property
     def blocks_at_the_end(self) -> int:
         """If as many Gaussians come as are expected."""
-        if not self.limit:
+        if not self.limits.block_limit:
             return self.blocks
-        return max(self.blocks, _fewest(self.gaussians, self.limit, self.sole))
-
-    @property
-    def limits(self) -> dict[str, int]:
-        """What of it a run keeps to: FITTED, by name."""
-        values = self.limit, self.sole, self.batch, self.crop_pixels, self.pass_gaussians, self.late_harmonics
-        return dict(zip(FITTED, values, strict=True))
+        return max(self.blocks, _fewest(self.gaussians, self.limits.block_limit, self.limits.sole_limit))
 
     def in_words(self) -> str:
         """One line for the terminal."""
         blocks = "1 block" if self.blocks == 1 else f"{self.blocks} blocks"
-        limit = self.sole if self.blocks == 1 else self.limit
+        limits, most = self.limits, self.limits.of_block(self.blocks)
         grows = "a block that comes near that is cut in two."
-        if not self.limit:
+        if not limits.block_limit:
             grows = "there is no room for the layers of more, and the scene stops growing at that."
-        budget = f"{bytes_in_words(self.budget)} of the device allow {limit:,} Gaussians in a block"
+        budget = f"{bytes_in_words(self.budget)} of the device allow {most:,} Gaussians in a block"
         said = f"{budget}: {blocks} to begin with; {grows}"
-        if self.crop_pixels:
-            said += f" Photos are large: steps draw parts of {self.crop_pixels / 1e6:.2g} megapixels."
-        if self.late_harmonics:
-            late = "highest degree" if self.late_harmonics == 1 else f"{self.late_harmonics} highest degrees"
-            said += f" Harmonics of the {late} come after growth."
+        if limits.crop_pixels:
+            said += f" Photos are large: steps draw parts of {limits.crop_pixels / 1e6:.2g} megapixels."
+        if late := limits.late_harmonics:
+            degrees = "highest degree" if late == 1 else f"{late} highest degrees"
+            said += f" Harmonics of the {degrees} come after growth."
         return said
 
 
@@ -106,26 +89,22 @@ class Demand:
     points: int
     """Gaussians that the scene begins with."""
     training: TrainingConfig
-    most: int | None = None
-    """Limit on Gaussians in the whole scene; None for none."""
     factor: int = 1
     """By which the photos were reduced."""
     blocks: int = 1
     """That there are already."""
     on_cpu: bool = False
     """Whether layers and photos are kept in RAM, under a budget of their own."""
-    late_harmonics: int = 0
-    """See Limits."""
 
     @property
     def first(self) -> int:
         """Gaussians at the start."""
-        return self.points if self.most is None else min(self.points, self.most)
+        return min(self.points, self.training.density.limit or self.points)
 
     @property
     def gaussians(self) -> int:
         """Gaussians expected at the end."""
-        return self.most or EXPECTED_GROWTH * self.points
+        return self.training.density.limit or EXPECTED_GROWTH * self.points
 
     def reduced(self, times: int) -> "Demand":
         """The same on smaller photos."""
@@ -138,19 +117,25 @@ class Demand:
 
     def needs(self, blocks: int, crop_pixels: int, levels: int) -> DeviceNeeds:
         """What that takes in one block or several."""
-        training, views = self.training, views_per_step(self.training.batch, blocks)
-        at_once = min(views, self.at_once)
-        options = (training.sh_degree, crop_pixels, levels, not self.on_cpu, training.primitive)
-        degree = max(training.sh_degree - self.late_harmonics, 0)
-        return DeviceNeeds(self.pixels, at_once, *options, views - at_once, degree)
+        limits = replace(self.training.limits, batch_limit=self.at_once, crop_pixels=crop_pixels)
+        needs = needs_of(replace(self.training, limits=limits), self.pixels, blocks)
+        return replace(needs, levels=levels, keeps=not self.on_cpu)
+
+    def fit(self, budget: int, blocks: int, **limits: int) -> Fit:
+        """So many blocks within `budget` bytes and these limits."""
+        limits = replace(self.training.limits, batch_limit=self.at_once, **limits)
+        return Fit(blocks, budget, self.gaussians, limits)
 
     def with_fewer_harmonics(self) -> Iterator["Demand"]:
         """The same with all degrees of harmonics while blocks grow, then with ever fewer."""
-        return (replace(self, late_harmonics=late) for late in range(self.training.sh_degree + 1))
+        for late in range(self.training.sh_degree + 1):
+            limits = replace(self.training.limits, late_harmonics=late)
+            yield replace(self, training=replace(self.training, limits=limits))
 
     def most_beside(self, limit: int) -> int:
         """Frozen Gaussians that a pass may draw beside a block at its limit, with all its harmonics."""
-        needs, whole = (replace(self, late_harmonics=n).needs(2, 0, 0) for n in (self.late_harmonics, 0))
+        needs = self.needs(2, 0, levels=0)
+        whole = replace(needs, active_degree=needs.sh_degree)
         return whole.frozen_beside(limit * needs.gaussian_bytes // whole.gaussian_bytes)
 
 
@@ -158,8 +143,7 @@ def fit_run(
     options: RunOptions, budget: int, pixels: int, factor: int, gaussians: int, on_cpu: bool, blocks: int = 1
 ) -> Fit:
     """What a run's options allow within `budget` bytes; see Demand for the others, find_fit for errors."""
-    training, room = options.training, options.gaussian_bytes
-    demand = Demand(pixels, gaussians, training, training.density.limit, factor, blocks, on_cpu)
+    room, demand = options.gaussian_bytes, Demand(pixels, gaussians, options.training, factor, blocks, on_cpu)
     if not room:
         return find_fit(budget, demand)
     if (fit := _best(_fit_gaussians(room, each) for each in demand.with_fewer_harmonics())) is None:
@@ -192,15 +176,14 @@ def _best(fits: Iterable[Fit | None]) -> Fit | None:
 
 def _fit_gaussians(room: int, demand: Demand) -> Fit | None:
     """The fewest blocks whose Gaussians take no more than `room` bytes, pictures and layers apart."""
-    training = demand.training
     sole, limit = (room // demand.needs(blocks, 0, levels=0).gaussian_bytes for blocks in (1, 2))
     if limit < LEAST_LIMIT:
         return None
-    blocks, overlap = _fewest(demand.first, limit, sole), training.recipe.overlap
+    blocks, overlap = _fewest(demand.first, limit, sole), demand.training.recipe.overlap
     if overlap > 0:  # an isolated block begins with what lies around its cell, too, and is never cut
         blocks, limit, sole = _fewest(math.ceil((1 + 2 * overlap) ** 2 * demand.first), limit, 0), 0, limit
-    most = demand.most_beside(limit or sole)
-    return Fit(blocks, limit, sole, room, demand.gaussians, 0, demand.at_once, most, demand.late_harmonics)
+    kept = {"crop_pixels": 0, "pass_gaussians": demand.most_beside(limit or sole)}
+    return demand.fit(room, blocks, block_limit=limit, sole_limit=sole, **kept)
 
 
 def _fit(budget: int, demand: Demand) -> Fit | None:
@@ -219,9 +202,8 @@ def _fit(budget: int, demand: Demand) -> Fit | None:
     if not limit and not fits_in_one:
         return None
     blocks = 1 if fits_in_one else _fewest(demand.first, limit, 0)
-    most = max(demand.most_beside(limit), LEAST_PASS)
-    found = blocks, limit, max(sole, 0), budget, demand.gaussians, crop, demand.at_once, most
-    return Fit(*found, demand.late_harmonics)
+    kept = {"crop_pixels": crop, "pass_gaussians": max(demand.most_beside(limit), LEAST_PASS)}
+    return demand.fit(budget, blocks, block_limit=limit, sole_limit=max(sole, 0), **kept)
 
 
 def _crop(budget: int, demand: Demand) -> int:
@@ -277,12 +259,12 @@ def has_workers(options: RunOptions) -> bool:
 def blocks_to_begin_with(fit: Fit, workers: int, seen: float) -> int:
     """As few as fit the device, but enough for every worker, of which 0 stands for one process; and two where
     a view sees only a share `seen` of the points that is LITTLE. A UserError if workers have no room."""
-    if workers and not fit.limit:
+    if workers and not fit.limits.block_limit:
         raise UserError(
             f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
             "workers need: train without workers, or on smaller photos."
         )
-    return max(fit.blocks, BLOCKS_EACH * workers, 2 if fit.limit and seen < LITTLE else 1)
+    return max(fit.blocks, BLOCKS_EACH * workers, 2 if fit.limits.block_limit and seen < LITTLE else 1)
 
 
 def works_at_once(recipe: Recipe) -> bool:

@@ -1,6 +1,7 @@
 """The options of a run, beside those of training itself."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Literal
@@ -48,8 +49,7 @@ class RunOptions:
 
     def check_ranges(self) -> None:
         """Look for options that are out of range, those of training too; a UserError names the first."""
-        for name in NOT_BELOW_0:
-            check_not_below_0(self, name)
+        check_not_below_0(self, NOT_BELOW_0)
         if self.blocks > MAX_BLOCKS:
             raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {self.blocks}.")
         if self.max_seconds is not None and not 0 < self.max_seconds < math.inf:
@@ -58,8 +58,9 @@ class RunOptions:
         self.training.check()
 
 
-def check_not_below_0(options: object, name: str) -> None:
+def check_not_below_0(options: object, names: Iterable[str]) -> None:
     """Raise a UserError if a number, by its dotted name, is below 0 or not finite."""
-    if not 0 <= (value := attrgetter(name)(options)) < math.inf:
-        flag = name.replace("_", "-")
-        raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")
+    for name in names:
+        if not 0 <= (value := attrgetter(name)(options)) < math.inf:
+            flag = name.replace("_", "-")
+            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")

@@ -12,6 +12,7 @@ from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.train.run_state import TOO_FEW_VIEWS, BlockHealth, RunState
 from abcd_ns.engine.train.step.final_pruning import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.terminal import many
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.guard import THIS_MACHINE
 
@@ -89,8 +90,7 @@ def worker_line(worker: WorkerSeen) -> str:
     if worker.block is not None:
         what = f"block {worker.block + 1}, step {worker.done} of {worker.steps}"
     lost = f", replaced {worker.deaths}x" if worker.deaths else ""
-    visits = "1 visit" if worker.visits == 1 else f"{worker.visits} visits"
-    return f"Worker {worker.worker + 1}: {what}; {visits}{lost}"
+    return f"Worker {worker.worker + 1}: {what}; {many(worker.visits, 'visit', 'visits')}{lost}"
 
 
 def block_table(rows: Sequence[BlockRow]) -> str:

@@ -16,15 +16,16 @@ from abcd_ns.cli.plan import Wanted
 from abcd_ns.cli.plan.command import plan
 from abcd_ns.cli.plan.forecast import LOST, Capture, Forecast, forecast, print_forecast
 from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.inspection import inspect
-from abcd_ns.run.fit import FITTED, Fit, blocks_to_begin_with
+from abcd_ns.run.fit import Fit, blocks_to_begin_with
 from abcd_ns.units import GIB
 from tests.cli.test_check import wide
 from tests.data.dataparser_scenes import NAMES, parser, write_capture
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-FULL = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000)
+FULL = Fit(1, GIB, 1000, Limits(sole_limit=5000))
 BUDGETS = Path(__file__).parents[2] / "docs" / "results" / "budgets"
 
 
@@ -60,7 +61,7 @@ def test_a_forecast_adds_up():
 def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
     """As in training, which fits nothing to the device then."""
     found = planned(Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5))
-    assert found.fit.limits == dict.fromkeys(FITTED, 0)
+    assert found.fit.limits == Limits()
     assert "1,500,000 Gaussians" in next(iter(found.shares["device"]))
     assert any("on the device" in line for line in found.warnings)
 
@@ -97,7 +98,7 @@ def with_photos_of(width: int, height: int) -> Capture:
 
 def test_large_photos_are_planned_for_as_they_are_trained_on():
     found = planned(Wanted(device_budget_gb=0.15), with_photos_of(2600, 100))
-    assert 0 < found.fit.crop_pixels < 260_000
+    assert 0 < found.fit.limits.crop_pixels < 260_000
     assert sum(found.shares["device"].values()) <= 0.15 * GIB
     assert not found.warnings
     # What does not fit is helped by options of this command.

@@ -9,7 +9,7 @@ import torch
 
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.store import crash_points
-from tests.nerfstudio.test_training import configure
+from tests.nerfstudio.test_training import configure, run
 from tests.reference.crash_runs import Kill, Runs, killer
 
 STEPS_PER_SAVE = 10
@@ -38,17 +38,12 @@ def train(
         crash_points.reached = killer(kill)
     config = configure(data, out, **options)
     config.pipeline.training.commit_seconds = commit_seconds
-    config.set_timestamp()
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
 
     def end(event: Event) -> None:
         if isinstance(event, StepTaken) and event.step == kill_at_step:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    trainer.pipeline.coordinator.announce.subscribe(end)
-    trainer.train()
+    run(config, listener=end)
 
 
 class Trainings(Runs):

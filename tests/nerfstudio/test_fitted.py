@@ -3,6 +3,7 @@
 import torch
 
 from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.trainer import AbcdTrainer
@@ -12,7 +13,8 @@ from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 
 STEPS = 16
-FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GIB, gaussians=300, crop_pixels=600)
+LIMITS = {"block_limit": 5000, "sole_limit": 5000, "batch_limit": 1, "crop_pixels": 600}
+FIT = Fit(blocks=3, budget=GIB, gaussians=300, limits=Limits(**LIMITS))
 
 
 def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_path, monkeypatch, capsys):
@@ -30,7 +32,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
     assert "steps draw parts of 0.0006 megapixels" in capsys.readouterr().out
     with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
-        assert {name: store.header[name] for name in FIT.limits} == FIT.limits
+        assert {name: store.header[name] for name in LIMITS} == LIMITS
     resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
     assert resumed.pipeline.coordinator.config.limits.crop_pixels == 600
     assert resumed.pipeline.coordinator.config.limits.batch_limit == 1
@@ -53,8 +55,7 @@ def test_a_run_that_resumes_with_the_budget_it_has_keeps_its_limits(data, tmp_pa
         folder = begun("stopped", 0.5, 9).base_dir
     same, other = (begun(f"with {gib}", gib, 11, load_dir=folder) for gib in (0.5, 2.0))
     limits = [trainer.pipeline.coordinator.config.limits.sole_limit for trainer in (same, other)]
-    assert limits[0] == FIT.sole
-    assert limits[1] != FIT.sole
+    assert limits[0] == LIMITS["sole_limit"] != limits[1]
     later = begun("without", 0.0, 13, load_dir=other.base_dir)
     assert later.pipeline.coordinator.config.limits.sole_limit == limits[1]
     more = begun("with more", 4.0, 15, load_dir=later.base_dir)

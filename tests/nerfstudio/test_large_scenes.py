@@ -8,16 +8,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.nerfstudio.model import AbcdModel
-from abcd_ns.nerfstudio.trainer import AbcdTrainer
-from tests.nerfstudio.test_training import configure, run
 
 CLOSE = 5e-4
 """Drawing stops where 1e-4 of the light is left, and a node knows nothing of the others."""
-
-
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory) -> AbcdTrainer:
-    return run(configure(data, tmp_path_factory.mktemp("out"), steps=12))
 
 
 @pytest.fixture
@@ -43,15 +36,6 @@ def pictures(pipeline) -> list[dict]:
     return [pipeline.model.get_outputs_for_camera(camera) for camera, _ in loader]
 
 
-def assert_same_surfaces(found: list[dict], expected: list[dict]) -> None:
-    """But for pixels that lie on an edge: there rounding chooses between two Gaussians."""
-    for one, other in zip(found, expected, strict=True):
-        for name, channels in (("normals", 3), ("depth_median", 1)):
-            assert one[name].shape == (*one["rgb"].shape[:2], channels)
-            assert float(((one[name] - other[name]).abs() > 5e-3).float().mean()) < 0.01, name
-        assert float((one["depth_median"] > 0).float().mean()) > 0.5
-
-
 def assert_same_pictures(found: list[dict], expected: list[dict]) -> None:
     assert len(found) == len(expected) > 0
     for one, other in zip(found, expected, strict=True):
@@ -64,14 +48,12 @@ def assert_same_pictures(found: list[dict], expected: list[dict]) -> None:
 def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     expected, count = pictures(pipeline), len(pipeline.model.means)
-    surfaces = [dict(one.items()) for one in expected]  # drawn now
     assert set(drawn) == {count}
     drawn.clear()
     short_of_memory(monkeypatch)
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     found = pictures(pipeline)
     assert_same_pictures(found, expected)
-    assert_same_surfaces(found, surfaces)
     assert max(drawn) < count
     assert len(drawn) > len(expected)
 

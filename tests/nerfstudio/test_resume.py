@@ -3,6 +3,7 @@
 import random
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,12 +21,6 @@ from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians
 from tests.nerfstudio.test_training import STEPS, configure, run, set_option
 from tests.reference.crash_runs import Kill
 from tests.reference.scenes import ring_of_views
-
-
-@pytest.fixture(scope="module")
-def undisturbed(data, tmp_path_factory) -> Path:
-    """The folder of a run that nothing disturbed. Read only."""
-    return run(configure(data, tmp_path_factory.mktemp("out"))).base_dir
 
 
 @pytest.fixture(scope="module")
@@ -57,24 +52,24 @@ def written(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def refusal(config, capsys, late: bool = False) -> str:
-    """What a run that cannot begin says before it exits with code 2, with nothing written unless photos or
-    blocks have to be read to find out."""
-    capsys.readouterr()
-    before = written(config.output_dir)
-    with pytest.raises(SystemExit) as ended:
-        run(config)
-    assert ended.value.code == 2
-    assert late or written(config.output_dir) == before
-    said = capsys.readouterr().out
-    assert "error:" in said
-    return said
+@pytest.fixture
+def refusal(said_at_exit) -> Callable[..., str]:
+    """What a run that cannot begin says before it exits with code 2, with nothing written."""
+
+    def refuse(config) -> str:
+        before = written(config.output_dir)
+        said = said_at_exit(run, config)
+        assert written(config.output_dir) == before
+        assert "error:" in said
+        return said
+
+    return refuse
 
 
 # Kills
 
 
-def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, undisturbed, tmp_path):
+def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, trained, tmp_path):
     killed_at = STEPS_PER_SAVE
     options = {"kill_at_step": killed_at, "commit_seconds": 0.0}
     assert trainings.finish(data, tmp_path / "killed", **options) == -signal.SIGKILL
@@ -82,14 +77,14 @@ def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, dat
     assert not list(killed.rglob("*.ckpt"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=killed / "nerfstudio_models"))
     assert 0 < resumed.resumed_from.step <= killed_at
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
 @pytest.mark.parametrize(
     "point",
     [crash_points.CHECKPOINT_PINNED, crash_points.CHECKPOINT_WRITTEN, crash_points.CHECKPOINT_IN_PLACE],
 )
-def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbed, tmp_path, point):
+def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, trained, tmp_path, point):
     assert trainings.finish(data, tmp_path / "killed", kill=Kill(point, 2)) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")
     files = [path.name for path in (killed / "nerfstudio_models").iterdir()]
@@ -98,28 +93,21 @@ def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbe
     resumed = run(configure(data, tmp_path / "killed", load_dir=killed))  # in the same folder
     assert resumed.base_dir == killed
     assert resumed.resumed_from.step == 2 * STEPS_PER_SAVE + 1
-    assert_same(killed, undisturbed)
+    assert_same(killed, trained.base_dir)
     assert len(list((killed / "nerfstudio_models").iterdir())) == 1
     assert not list(killed.glob(".*"))
 
 
-def test_an_older_checkpoint_can_be_asked_for(data, stopped, undisturbed, tmp_path):
+def test_an_older_checkpoint_can_be_asked_for(data, stopped, trained, tmp_path):
     resumed = run(configure(data, tmp_path / "b", load_dir=stopped, load_step=STEPS_PER_SAVE))
     assert (resumed.resumed_from.step, resumed.resumed_from.pin) == (STEPS_PER_SAVE + 1, "step-000000010")
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
     checkpoint = stopped / "nerfstudio_models" / "step-000000010.ckpt"
     again = run(configure(data, tmp_path / "c", load_checkpoint=checkpoint, steps=STEPS_PER_SAVE + 2))
     assert again.pipeline.coordinator.state.step == STEPS_PER_SAVE + 2
 
 
-def test_the_very_folder_can_go_back_to_a_checkpoint(data, stopped, undisturbed):
-    out = stopped.parents[2]
-    resumed = run(configure(data, out, load_dir=stopped, load_step=STEPS_PER_SAVE))
-    assert resumed.base_dir == stopped
-    assert_same(stopped, undisturbed)
-
-
-def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_path, undisturbed):
+def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_path, trained):
     """ns-eval would open these, and not what the run has come to since."""
     options = {"save_only_latest_checkpoint": False}
     folder = run(configure(data, tmp_path, **options), stop_after=34).base_dir
@@ -129,7 +117,7 @@ def test_going_back_in_the_very_folder_leaves_no_later_checkpoints(data, tmp_pat
     resumed = run(configure(data, tmp_path, load_dir=folder, **options))
     assert resumed.resumed_from.step < 20
     assert saved(folder) == [10, 20, 30, STEPS - 1]
-    assert_same(folder, undisturbed)
+    assert_same(folder, trained.base_dir)
 
 
 def saved(folder: Path) -> list[int]:
@@ -144,7 +132,7 @@ def saved(folder: Path) -> list[int]:
 
 @pytest.mark.parametrize(("number", "event"), [(signal.SIGINT, StepTaken), (signal.SIGTERM, LayersDrawn)])
 def test_a_signal_commits_and_says_how_to_go_on(
-    data, undisturbed, tmp_path, capsys, monkeypatch, number, event
+    data, trained, tmp_path, monkeypatch, said_at_exit, number, event
 ):
     config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
@@ -156,10 +144,7 @@ def test_a_signal_commits_and_says_how_to_go_on(
         if left == 0 and isinstance(happened, event):
             signal.raise_signal(number)
 
-    with pytest.raises(SystemExit) as ended:
-        run(config, listener=interrupt)
-    assert ended.value.code == 128 + number
-    said = capsys.readouterr().out
+    said = said_at_exit(run, config, listener=interrupt, code=128 + number)
     assert f"Stopped by {number.name} after step" in said
     assert "nothing is lost" in said
     folder = run_folder(tmp_path / "signal")
@@ -169,10 +154,10 @@ def test_a_signal_commits_and_says_how_to_go_on(
     assert taken == 17 or event is LayersDrawn
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
     assert resumed.resumed_from.step == taken
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
-def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypatch):
+def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, monkeypatch, said_at_exit):
     config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
@@ -183,12 +168,9 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
             signal.raise_signal(signal.SIGINT)
 
     try:
-        with pytest.raises(SystemExit) as ended:
-            run(config, listener=interrupt)
+        said = said_at_exit(run, config, listener=interrupt, code=130)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert ended.value.code == 130
-    said = capsys.readouterr().out
     assert "Stopped at once" in said
     assert f"ns-train abcd --load-dir {run_folder(tmp_path / 'signal')}/nerfstudio_models" in said
 
@@ -201,17 +183,14 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
     ],
 )
 def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(
-    data, tmp_path, capsys, monkeypatch, where, words
+    data, tmp_path, monkeypatch, said_at_exit, where, words
 ):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
     monkeypatch.setattr(f"abcd_ns.{where}", interrupt)
-    with pytest.raises(SystemExit) as ended:
-        run(configure(data, tmp_path / "signal"))
-    assert ended.value.code == 130
-    said = capsys.readouterr().out
+    said = said_at_exit(run, configure(data, tmp_path / "signal"), code=130)
     assert words in said
     assert "--load-dir" not in said
 
@@ -225,10 +204,10 @@ def test_going_on_for_no_more_steps_completes_the_run(data, stopped, tmp_path):
     assert (state.active, state.step, state.pruned_at) == (None, before.step, before.step)
 
 
-def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path, capsys):
+def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path, refusal):
     (checkpoint,) = (stopped / "nerfstudio_models").iterdir()
     copied = Path(shutil.copy(checkpoint, checkpoint.with_name("my best.ckpt")))
-    said = refusal(configure(data, tmp_path / "b", load_checkpoint=copied), capsys)
+    said = refusal(configure(data, tmp_path / "b", load_checkpoint=copied))
     assert "my best.ckpt can be viewed but not trained further" in said
 
 
@@ -236,7 +215,7 @@ def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path
 
 
 def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
-    data, undisturbed, tmp_path, capsys, monkeypatch
+    data, trained, tmp_path, monkeypatch, said_at_exit
 ):
     def full(_, path):
         Path(path).write_bytes(b"half")
@@ -244,20 +223,17 @@ def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
 
     with monkeypatch.context() as patch:
         patch.setattr("abcd_ns.nerfstudio.trainer.torch.save", full)
-        with pytest.raises(SystemExit) as ended:
-            run(configure(data, tmp_path / "full"))
-    assert ended.value.code == 2
-    said = capsys.readouterr().out
+        said = said_at_exit(run, configure(data, tmp_path / "full"))
     assert "step-000000010.ckpt could not be written" in said
     assert "the store is safe" in said
     folder = run_folder(tmp_path / "full")
     assert not list(folder.glob(".*"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
     assert resumed.resumed_from.step == STEPS_PER_SAVE + 1
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
-def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stopped, undisturbed, tmp_path):
+def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stopped, trained, tmp_path):
     (checkpoint,) = (stopped / "nerfstudio_models").iterdir()
     means = gaussians(stopped)["_model.gauss_params.means"].numpy().tobytes()
     sound = checkpoint.read_bytes()
@@ -274,20 +250,20 @@ def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stoppe
             eval_setup(stopped / "config.yml", update_config_callback=moved)
     checkpoint.write_bytes(sound[: len(sound) // 2])
     resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped))
-    assert_same(resumed.base_dir, undisturbed)
+    assert_same(resumed.base_dir, trained.base_dir)
 
 
 # What cannot be resumed
 
 
-def test_a_second_run_in_a_folder_is_refused_until_the_first_is_gone(data, stopped, capsys):
+def test_a_folder_that_holds_a_run_is_refused_to_any_other(data, stopped, tmp_path, refusal):
     out = stopped.parents[2]
-    first = ParameterStore.open(stopped / "abcd" / "store")
-    said = refusal(configure(data, out, load_dir=stopped), capsys)
-    assert "is being written by another run" in said
-    first.close()
-    said = refusal(configure(data, out), capsys)
-    assert f"holds a run already: add --load-dir {stopped}" in said
+    other = run_folder(Path(shutil.copytree(out, tmp_path / "other")))
+    with ParameterStore.open(stopped / "abcd" / "store"):
+        assert "is being written by another run" in refusal(configure(data, out, load_dir=stopped))
+    for options in ({}, {"load_dir": other}):
+        said = refusal(configure(data, out, **options))
+        assert f"{stopped / 'abcd' / 'store'} holds a run already: add --load-dir {stopped}" in said
 
 
 @pytest.mark.parametrize(
@@ -299,17 +275,17 @@ def test_a_second_run_in_a_folder_is_refused_until_the_first_is_gone(data, stopp
     ],
 )
 def test_other_options_than_the_stores_are_refused_and_both_are_shown(
-    data, stopped, tmp_path, capsys, name, value, said
+    data, stopped, tmp_path, refusal, name, value, said
 ):
     config = configure(data, tmp_path / "b", load_dir=stopped)
     set_option(config, name, value)
-    assert said in refusal(config, capsys)
+    assert said in refusal(config)
 
 
-def test_a_refused_run_leaves_the_config_of_the_one_it_was_to_resume(data, stopped, capsys):
+def test_a_refused_run_leaves_the_config_of_the_one_it_was_to_resume(data, stopped, refusal):
     config = configure(data, stopped.parents[2], load_dir=stopped)  # the very folder
     config.pipeline.datamanager.dataparser.downscale_factor = 2
-    assert "it was made for photos" in refusal(config, capsys)
+    assert "it was made for photos" in refusal(config)
 
 
 def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
@@ -340,22 +316,17 @@ def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
         mine.check(store)  # nothing was written down
 
 
-@pytest.mark.parametrize("what", ["nothing", "checkpoint alone", "another method's", "not begun"])
-def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
-    models = tmp_path / "run" / "nerfstudio_models"
+def test_a_folder_without_a_run_says_so(data, tmp_path, refusal):
+    folder, models = tmp_path / "run", tmp_path / "run" / "nerfstudio_models"
     models.mkdir(parents=True)
-    if what in ("checkpoint alone", "another method's"):
-        (models / "step-000000010.ckpt").write_bytes(b"")
-    if what == "not begun":
-        ParameterStore.create(tmp_path / "run" / "abcd" / "store", {}).close()
-    expected = {
-        "nothing": "There is no run of ABCD",
-        "checkpoint alone": "can be viewed but not trained further",
-        "another method's": f"{models.parent} can be viewed but not trained further",
-        "not begun": "ended before it began: start it anew",
-    }
-    asked = models.parent if what == "another method's" else models
-    assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=asked), capsys)
+    assert "There is no run of ABCD" in refusal(configure(data, tmp_path / "out", load_dir=models))
+    (models / "step-000000010.ckpt").write_bytes(b"")
+    for asked in (models, folder):  # as another method leaves it
+        said = refusal(configure(data, tmp_path / "out", load_dir=asked))
+        assert f"{folder} can be viewed but not trained further" in said
+    ParameterStore.create(folder / "abcd" / "store", {}).close()
+    said = refusal(configure(data, tmp_path / "out", load_dir=models))
+    assert "ended before it began: start it anew" in said
 
 
 @pytest.mark.parametrize(
@@ -367,11 +338,5 @@ def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
         ({"load_checkpoint": Path("x")}, "There is no checkpoint x"),
     ],
 )
-def test_options_that_do_not_say_where_to_go_on_are_refused(data, tmp_path, capsys, options, said):
-    assert said in refusal(configure(data, tmp_path / "out", **options), capsys)
-
-
-def test_another_runs_folder_is_not_taken_whatever_is_gone_on_with(data, stopped, tmp_path, capsys):
-    other = run_folder(Path(shutil.copytree(stopped.parents[2], tmp_path / "other")))
-    said = refusal(configure(data, stopped.parents[2], load_dir=other), capsys)
-    assert f"{stopped / 'abcd' / 'store'} holds a run already" in said
+def test_options_that_do_not_say_where_to_go_on_are_refused(data, tmp_path, refusal, options, said):
+    assert said in refusal(configure(data, tmp_path / "out", **options))

@@ -5,14 +5,13 @@ import json
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import EpochEnded, HeldOutScored, StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import run_log, settings
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
@@ -20,52 +19,45 @@ from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.run import SETTINGS_FILE
 from tests.nerfstudio.test_training import STEPS, configure, run
 
-
-@dataclass
-class FakeCoordinator:
-    step: int = 0
-    seconds: float = 0.0
-    visit: int = 0
-    config: object = field(default_factory=lambda: SimpleNamespace(density=SimpleNamespace(limit=None)))
-    scene: object = field(default_factory=lambda: SimpleNamespace(tree=SimpleNamespace(num_blocks=2)))
-
-    @property
-    def state(self):
-        return self
-
-    @property
-    def stopwatch(self):
-        return self
-
-    def count(self) -> int:
-        return 100 + self.step
+PHOTOS = SimpleNamespace(cached_bytes=7, budget_bytes=10)
 
 
-def lines_of(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+def coordinator_at(step: int = 0, seconds: float = 0.0) -> SimpleNamespace:
+    """All that a log asks a coordinator for."""
+    config = SimpleNamespace(density=SimpleNamespace(limit=None))
+    scene = SimpleNamespace(tree=SimpleNamespace(num_blocks=2), cached_bytes=0, ram_bytes=0)
+    parts = {"config": config, "scene": scene, "count": lambda: 100, "layer_bytes": 0, "layer_limit": 0}
+    found = SimpleNamespace(step=step, seconds=seconds, visit=0, **parts)
+    found.state = found.stopwatch = found
+    return found
 
 
-def take_steps(log: RunLog, coordinator: FakeCoordinator, count: int, seconds: float, psnr: float = 20.0):
+def lines_of(path: Path, kind: str | None = None) -> list[dict]:
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return [line for line in lines if kind in (None, line["kind"])]
+
+
+def take_steps(log: RunLog, count: int, seconds: float, psnr: float = 20.0):
+    coordinator = log._coordinator
     for _ in range(count):
         coordinator.step += 1
         coordinator.seconds += seconds
         log(StepTaken(coordinator.step, 0, coordinator.step, psnr))
 
 
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "log.jsonl"
+
+
+@pytest.fixture
+def log(path) -> RunLog:
+    return RunLog(coordinator_at(), PHOTOS, path)
+
+
 @pytest.fixture(scope="module")
 def trained(data, tmp_path_factory):
-    """A run whose clock stood still whenever it was evaluated."""
-    trainers, seen = [], []
-
-    def look(event) -> None:
-        if isinstance(event, HeldOutScored):
-            clock = trainers[0].pipeline.coordinator.stopwatch
-            seen.append(clock.seconds == clock.seconds)
-
-    config = configure(data, tmp_path_factory.mktemp("out"), steps_per_eval_all_images=15)
-    trainer = run(config, after_step=trainers.append, listener=look)
-    assert seen == [True] * 3
-    return trainer
+    return run(configure(data, tmp_path_factory.mktemp("out"), steps_per_eval_all_images=15))
 
 
 def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch):
@@ -78,22 +70,23 @@ def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch):
 
 
 def test_a_run_tells_its_visits_its_evaluations_and_its_end(trained):
-    lines = lines_of(trained.base_dir / "abcd" / LOG_FILE)
+    path = trained.base_dir / "abcd" / LOG_FILE
+    lines = lines_of(path)
     kinds = Counter(line["kind"] for line in lines)
     assert [lines[0]["kind"], lines[-1]["kind"]] == ["training", "end"]
     assert kinds["visit"] == kinds["visit end"] == trained.pipeline.coordinator.state.visit
     assert kinds["held out"] == 3  # after steps 15 and 30, and at the end
-    assert {line["block"] for line in lines if line["kind"] == "visit end"} == {None, 0, 1, 2}
+    assert {line["block"] for line in lines_of(path, "visit end")} == {None, 0, 1, 2}
     for name in ("step", "seconds"):
         values = [line[name] for line in lines]
         assert values == sorted(values)
     assert lines[-1]["step"] == STEPS
     assert lines[-1]["gaussians"] == trained.pipeline.coordinator.count()
-    assert all(line["psnr"] > 5 for line in lines if line["kind"] in ("visit end", "held out"))
-    samples = [line for line in lines if line["kind"] == "sample"]
-    assert samples[-1]["rss_bytes"] > 100 << 20
-    assert samples[-1]["held"]["photos"] > 0
-    assert samples[-1]["held"].keys() == lines[0]["budgets"].keys()
+    assert all(line["psnr"] > 5 for kind in ("visit end", "held out") for line in lines_of(path, kind))
+    sample = lines_of(path, "sample")[-1]
+    assert sample["rss_bytes"] > 100 << 20
+    assert sample["held"]["photos"] > 0
+    assert sample["held"].keys() == lines[0]["budgets"].keys()
 
 
 def test_settings_are_plain_values_of_every_option(trained):
@@ -109,93 +102,83 @@ def test_a_resumed_run_has_the_past_up_to_where_it_goes_on_and_no_more(data, tmp
     stop_after = 27
     broken = run(configure(data, tmp_path / "broken"), stop_after=stop_after)
     resumed = run(configure(data, tmp_path / "broken", load_dir=broken.checkpoint_dir))  # in its own folder
-    lines = lines_of(resumed.base_dir / "abcd" / LOG_FILE)
+    path = resumed.base_dir / "abcd" / LOG_FILE
+    lines = lines_of(path)
     went_on = resumed.resumed_from.step
     assert stop_after // 10 * 10 + 1 <= went_on <= stop_after
-    assert [line["step"] for line in lines if line["kind"] == "training"] == [0, went_on]
+    assert [line["step"] for line in lines_of(path, "training")] == [0, went_on]
     for name in ("step", "seconds"):
         values = [line[name] for line in lines]
         assert values == sorted(values)
+    undisturbed = trained.base_dir / "abcd" / LOG_FILE
     for kind in ("visit", "visit end"):
-        expected = [line for line in lines_of(trained.base_dir / "abcd" / LOG_FILE) if line["kind"] == kind]
-        found = [line for line in lines if line["kind"] == kind]
-        assert [(v["visit"], v["block"], v["step"]) for v in found] == [
-            (v["visit"], v["block"], v["step"]) for v in expected
-        ]
-    assert sum(line["kind"] == "end" for line in lines) == 1
+        found, expected = (
+            [(line["visit"], line["block"], line["step"]) for line in lines_of(each, kind)]
+            for each in (path, undisturbed)
+        )
+        assert found == expected
+    assert len(lines_of(path, "end")) == 1
     assert len({json.dumps(line) for line in lines}) == len(lines)
 
 
-def test_a_torn_or_foreign_past_is_kept_as_far_as_it_can_be_read(tmp_path):
-    past = FakeCoordinator()
-    log = RunLog(past, tmp_path / "old.jsonl")
-    take_steps(log, past, 5, seconds=1.0)
+def test_a_torn_or_foreign_past_is_kept_as_far_as_it_can_be_read(log, path, tmp_path):
+    take_steps(log, 5, seconds=1.0)
     log.close()
-    whole = (tmp_path / "old.jsonl").read_bytes()
-    readable = [line for line in lines_of(tmp_path / "old.jsonl") if line["kind"] != "end"]
-    (tmp_path / "old.jsonl").write_bytes(whole[: whole.rindex(b'{"kind": "end"') + 9] + b"\xff")
-    RunLog(FakeCoordinator(step=5, seconds=5.0), tmp_path / "new.jsonl", earlier=tmp_path / "old.jsonl")
+    whole, readable = path.read_bytes(), lines_of(path)[:-1]
+    path.write_bytes(whole[: whole.rindex(b'{"kind": "end"') + 9] + b"\xff")
+    RunLog(coordinator_at(step=5, seconds=5.0), PHOTOS, tmp_path / "new.jsonl", earlier=path)
     assert lines_of(tmp_path / "new.jsonl")[:-1] == readable
-    RunLog(FakeCoordinator(step=5), tmp_path / "without.jsonl", earlier=tmp_path / "absent.jsonl")
+    RunLog(coordinator_at(step=5), PHOTOS, tmp_path / "without.jsonl", earlier=tmp_path / "absent.jsonl")
     assert [line["step"] for line in lines_of(tmp_path / "without.jsonl")] == [5]
 
 
-def test_samples_thin_out_so_that_a_long_run_has_a_short_log(tmp_path):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl")
-    take_steps(log, coordinator, 4 * 3600, seconds=1.0)
+def test_samples_thin_out_so_that_a_long_run_has_a_short_log(log, path):
+    take_steps(log, 4 * 3600, seconds=1.0)
     log.close()
-    times = [line["seconds"] for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
+    times = [line["seconds"] for line in lines_of(path, "sample")]
     gaps = [later - earlier for earlier, later in pairwise(times)]
     assert gaps[0] == 1.0
     assert max(gaps) == pytest.approx(4 * 3600 / run_log.SAMPLES, rel=0.05)
     assert len(times) < 2000
 
 
-def test_the_psnr_of_a_visit_is_that_of_its_later_half(tmp_path):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl")
+def test_the_psnr_of_a_visit_is_that_of_its_later_half(log, path):
     log(VisitBegan(0, 0, 1, steps=4, views=4, gaussians=50))
     for psnr in (10.0, 12.0, 20.0, 22.0):
-        take_steps(log, coordinator, 1, seconds=0.1, psnr=psnr)
+        take_steps(log, 1, seconds=0.1, psnr=psnr)
     log(VisitEnded(0, 0, 1, gaussians=50, migrated=2, layer_seconds=0.1, seconds=0.4))
     log(EpochEnded(0, 4))
     log.close()
-    (ended,) = (line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "visit end")
+    (ended,) = lines_of(path, "visit end")
     assert (ended["psnr"], ended["visit_seconds"], ended["migrated"]) == (21.0, 0.4, 2)
 
 
-def test_a_visit_is_on_disk_when_it_has_ended_and_a_long_one_before(tmp_path):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl")
-    take_steps(log, coordinator, 10, seconds=1.0)
-    assert len(lines_of(tmp_path / "log.jsonl")) == 1
+def test_a_visit_is_on_disk_when_it_has_ended_and_a_long_one_before(log, path):
+    take_steps(log, 10, seconds=1.0)
+    assert len(lines_of(path)) == 1
     log(VisitEnded(0, 0, 1, gaussians=50, migrated=0, layer_seconds=0.1, seconds=0.4))
-    assert lines_of(tmp_path / "log.jsonl")[-1]["kind"] == "visit end"
-    before = len(lines_of(tmp_path / "log.jsonl"))
-    take_steps(log, coordinator, 2 * run_log.LINES_KEPT, seconds=1.0)
-    assert len(lines_of(tmp_path / "log.jsonl")) > before
+    before = lines_of(path)
+    assert before[-1]["kind"] == "visit end"
+    take_steps(log, 2 * run_log.LINES_KEPT, seconds=1.0)
+    assert len(lines_of(path)) > len(before)
 
 
 def test_a_disk_that_refuses_the_log_is_named_once_and_training_goes_on(tmp_path, capsys):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "gone" / "log.jsonl")
-    take_steps(log, coordinator, 200, seconds=1.0)
+    log = RunLog(coordinator_at(), PHOTOS, tmp_path / "gone" / "log.jsonl")
+    take_steps(log, 200, seconds=1.0)
     log.close()
     printed = capsys.readouterr().out
     assert printed.count("cannot be written") == 1
     assert "log.jsonl" in printed.replace("\n", "")
 
 
-def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(tmp_path):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl", {"photos": (lambda: 7, 10)})
+def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(log, path, tmp_path):
     for psnr in (10.0, math.nan, 20.0, math.inf):
-        take_steps(log, coordinator, 1, seconds=0.3, psnr=psnr)
-    take_steps(log, coordinator, 4, seconds=0.3, psnr=math.nan)
+        take_steps(log, 1, seconds=0.3, psnr=psnr)
+    take_steps(log, 4, seconds=0.3, psnr=math.nan)
     log.close()
-    samples = [line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
+    samples = lines_of(path, "sample")
     assert [line["psnr"] for line in samples] == [15.0, None, None]
-    assert samples[0]["held"] == {"photos": 7}
-    again = RunLog(coordinator, tmp_path / "again.jsonl", earlier=tmp_path / "log.jsonl")
+    assert samples[0]["held"]["photos"] == 7
+    again = RunLog(log._coordinator, PHOTOS, tmp_path / "again.jsonl", earlier=path)
     assert log.curve == again.curve == [(samples[0]["seconds"], 15.0)]

@@ -25,13 +25,6 @@ from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH
 
-STEPS = 24
-
-
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory) -> Path:
-    return run(configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)).base_dir
-
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:
     found = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.png"))}
@@ -61,13 +54,13 @@ def rendered(trained, tmp_path, monkeypatch):
     def draw(names: list[str], **extra) -> dict[str, np.ndarray]:
         out = tmp_path / "_".join([*names, *extra])
         render.RenderCameraPath(
-            load_config=trained / "config.yml",
+            load_config=trained.base_dir / "config.yml",
             output_path=out / "frames.mp4",
             image_format="png",
             output_format="images",
             rendered_output_names=names,
             eval_num_rays_per_chunk=7,
-            camera_path_filename=camera_path(trained, **extra),
+            camera_path_filename=camera_path(trained.base_dir, **extra),
         ).main()
         return pictures(out / "frames")
 
@@ -113,7 +106,10 @@ def test_pictures_without_background_have_alpha(rendered):
 
 def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
     render.DatasetRender(
-        load_config=trained / "config.yml", output_path=tmp_path, image_format="png", split="train+test"
+        load_config=trained.base_dir / "config.yml",
+        output_path=tmp_path,
+        image_format="png",
+        split="train+test",
     ).main()
     found = pictures(tmp_path)
     kinds = ("gt-rgb", "rgb", "depth", "accumulation", "background", "normals", "depth_median")
@@ -128,15 +124,15 @@ def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
 # Scores
 
 
-def evaluated(trained: Path, out: Path) -> dict:
-    ComputePSNR(load_config=trained / "config.yml", output_path=out / "scores.json").main()
+def evaluated(folder: Path, out: Path) -> dict:
+    ComputePSNR(load_config=folder / "config.yml", output_path=out / "scores.json").main()
     return json.loads((out / "scores.json").read_text())["results"]
 
 
 def test_without_weights_lpips_is_null_and_says_why(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     monkeypatch.delenv(metrics.FETCH, raising=False)
-    found = evaluated(trained, tmp_path)
+    found = evaluated(trained.base_dir, tmp_path)
     assert found["lpips"] is None
     assert found["psnr"] > 12
     assert "ABCD_FETCH_LPIPS=1" in found["lpips_missing"]
@@ -148,7 +144,7 @@ def test_weights_are_fetched_when_that_is_allowed(trained, tmp_path, monkeypatch
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     monkeypatch.setenv(metrics.FETCH, "1")
     monkeypatch.setattr(metrics, "_lpips", lambda _: lambda a, b: (a - b).abs().mean())
-    found = evaluated(trained, tmp_path)
+    found = evaluated(trained.base_dir, tmp_path)
     assert 0 < found["lpips"] < 1
     assert "lpips_missing" not in found
 
@@ -162,7 +158,7 @@ def test_weights_are_fetched_when_that_is_allowed(trained, tmp_path, monkeypatch
 
 
 def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
-    _, pipeline, _, _ = eval_setup(trained / "config.yml")
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     assert "tensor" not in repr(pipeline.model.get_outputs_for_camera(camera).keys())
     with pytest.raises(UserError, match="abcd mesh"):
@@ -170,9 +166,9 @@ def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
 
 
 def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
-    trained, rendered, monkeypatch, capsys
+    trained, rendered, monkeypatch, said_at_exit
 ):
-    _, pipeline, _, _ = eval_setup(trained / "config.yml")
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     straight = pipeline.model.view(camera)
     camera.camera_type = torch.full_like(camera.camera_type, CameraType.FISHEYE.value)
@@ -180,23 +176,18 @@ def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
         patched.setattr("abcd_ns.viewer.pictures.asked_by_viewer", lambda: True)
         assert torch.equal(pipeline.model.view(camera).viewmat, straight.viewmat)
     monkeypatch.setattr(
-        "sys.argv", ["ns-render", "camera-path", "--load-config", str(trained / "config.yml")]
+        "sys.argv", ["ns-render", "camera-path", "--load-config", str(trained.base_dir / "config.yml")]
     )
-    with pytest.raises(SystemExit):
-        rendered(["rgb"], camera_type="fisheye")
-    assert "error: Camera 0 is fisheye" in capsys.readouterr().out
+    assert "error: Camera 0 is fisheye" in said_at_exit(rendered, ["rgb"], camera_type="fisheye")
 
 
-def test_a_box_without_gaussians_ends_an_export_in_one_line(trained, monkeypatch, capsys):
+def test_a_box_without_gaussians_ends_an_export_in_one_line(trained, monkeypatch, said_at_exit):
     box = ["--obb_center", "9", "9", "9", "--obb-rotation", "0", "0", "0", "--obb_scale"]
-    words = ["ns-export", "gaussian-splat", "--load-config", str(trained / "config.yml"), *box]
+    words = ["ns-export", "gaussian-splat", "--load-config", str(trained.base_dir / "config.yml"), *box]
     monkeypatch.setattr("sys.argv", [*words, "99", "99", "99"])
-    eval_setup(trained / "config.yml")
+    eval_setup(trained.base_dir / "config.yml")
     monkeypatch.setattr("sys.argv", [*words, "0.1", "0.1", "0.1"])
-    with pytest.raises(SystemExit) as ended:
-        eval_setup(trained / "config.yml")
-    assert ended.value.code == 2
-    assert "error: No Gaussian lies in this box" in capsys.readouterr().out
+    assert "error: No Gaussian lies in this box" in said_at_exit(eval_setup, trained.base_dir / "config.yml")
 
 
 def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
@@ -209,35 +200,29 @@ def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
     assert torch.equal(model.shs_0, gaussians.features_dc)
 
 
-def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, capsys):
-    moved = shutil.copytree(trained, tmp_path / "renamed")
+def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, said_at_exit):
+    moved = shutil.copytree(trained.base_dir, tmp_path / "renamed")
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(moved / "config.yml")])
     _, _, checkpoint, _ = eval_setup(moved / "config.yml")
     assert checkpoint.parent == moved / "nerfstudio_models"
     checkpoint.unlink()
-    with pytest.raises(SystemExit):
-        eval_setup(moved / "config.yml")
-    assert f"{checkpoint.parent} has no checkpoint" in capsys.readouterr().out
+    assert f"{checkpoint.parent} has no checkpoint" in said_at_exit(eval_setup, moved / "config.yml")
 
 
 @pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])
 def test_what_a_user_can_repair_ends_a_tool_in_one_line(
-    data, trained, tmp_path, capsys, monkeypatch, moved, words
+    data, trained, tmp_path, monkeypatch, said_at_exit, moved, words
 ):
     scene = tmp_path / "elsewhere"
     if moved == "photos":
         for photo in (Path(shutil.copytree(data, scene)) / "images").iterdir():
             photo.write_bytes(b"no photo")
-    config = yaml.load((trained / "config.yml").read_text(), Loader=yaml.Loader)
+    config = yaml.load((trained.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
     config.data = config.pipeline.datamanager.data = scene
-    folder = Path(shutil.copytree(trained, tmp_path / "run"))
+    folder = Path(shutil.copytree(trained.base_dir, tmp_path / "run"))
     (folder / "config.yml").write_text(yaml.dump(config))
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(folder / "config.yml")])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as ended:
-        evaluated(folder, tmp_path)
-    assert ended.value.code == 2
-    said = capsys.readouterr().out
+    said = said_at_exit(evaluated, folder, tmp_path)
     assert "error:" in said
     assert words in said
 

@@ -94,11 +94,6 @@ def run(
     return trainer
 
 
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory) -> AbcdTrainer:
-    return run(configure(data, tmp_path_factory.mktemp("out")))
-
-
 @pytest.mark.parametrize("end", [RuntimeError, Stopped])
 def test_workers_end_with_their_run_and_visits_are_saved_where_it_is_stopped(data, tmp_path, end):
     """Once at once, since whoever stops it may not wait, and once with the visits under way."""
@@ -214,14 +209,10 @@ def test_seconds_end_a_run(data, tmp_path):
     assert (again.state.step, again.count()) == (ended.state.step, ended.count())
 
 
-def test_an_output_folder_that_is_a_file_is_refused(data, tmp_path, capsys):
+def test_an_output_folder_that_is_a_file_is_refused(data, tmp_path, said_at_exit):
     config = configure(data, tmp_path / "taken")
     config.output_dir.touch()
-    config.set_timestamp()
-    with pytest.raises(SystemExit) as stopped:
-        config.save_config()
-    assert stopped.value.code == 2
-    assert "another --output-dir" in capsys.readouterr().out
+    assert "another --output-dir" in said_at_exit(run, config)
     assert [*tmp_path.rglob("*")] == [config.output_dir]
 
 
@@ -240,24 +231,25 @@ def test_no_time_counts_while_the_viewer_has_the_run_paused(data, tmp_path):
     assert trainer.pipeline.coordinator.stopwatch.seconds < time.monotonic() - began - waited
 
 
-def test_no_time_counts_while_a_held_out_photo_is_compared(data, tmp_path, monkeypatch):
-    config, counting = configure(data, tmp_path, steps=4), []
-    config.steps_per_eval_batch, config.steps_per_eval_image = 1, 2
-    shown = AbcdDataManager.next_eval_image
+def test_no_time_counts_while_held_out_photos_are_compared(data, tmp_path, monkeypatch):
+    often = {"steps_per_eval_batch": 1, "steps_per_eval_image": 2, "steps_per_eval_all_images": 2}
+    counting, shown = [], AbcdDataManager._held_out
 
-    def watched(manager: AbcdDataManager, step: int):
+    def watched(manager: AbcdDataManager, row: int):
         before = manager._coordinator.stopwatch.seconds
         counting.append(manager._coordinator.stopwatch.seconds > before)
-        return shown(manager, step)
+        return shown(manager, row)
 
-    monkeypatch.setattr(AbcdDataManager, "next_eval_image", watched)
-    run(config)
-    assert len(counting) > 3
+    monkeypatch.setattr(AbcdDataManager, "_held_out", watched)
+    run(configure(data, tmp_path, steps=4, **often))
+    assert len(counting) > 6
     assert not any(counting)
 
 
 @pytest.mark.parametrize("kind", ["user", "signal"])
-def test_what_goes_wrong_in_the_last_scoring_ends_the_run_at_once(data, tmp_path, monkeypatch, kind):
+def test_what_goes_wrong_in_the_last_scoring_ends_the_run_at_once(
+    data, tmp_path, monkeypatch, said_at_exit, kind
+):
     scored = []
 
     def fails(self, outputs, batch):
@@ -271,7 +263,5 @@ def test_what_goes_wrong_in_the_last_scoring_ends_the_run_at_once(data, tmp_path
     monkeypatch.setattr(AbcdModel, "get_image_metrics_and_images", fails)
     config = configure(data, tmp_path, steps=4)
     config.steps_per_eval_all_images = 1000
-    with pytest.raises(SystemExit) as ended:
-        run(config)
-    assert ended.value.code == (2 if kind == "user" else 130)
+    said_at_exit(run, config, code=2 if kind == "user" else 130)
     assert len(scored) == 1

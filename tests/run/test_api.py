@@ -12,8 +12,11 @@ import torch
 
 from abcd_ns import RunOptions, TrainingConfig, UserError, View, train
 from abcd_ns.cli.export import export
-from abcd_ns.engine.events import StepTaken, VisitEnded
+from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
 from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.run import STATE, STORE
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import write_scene
@@ -125,9 +128,9 @@ def test_photos_of_double_precision_and_arrays_train_as_tensors_of_single(tmp_pa
             assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize(("sites", "expected"), [(2, {0}), (20, {0, 1})])
-def test_a_scene_of_which_views_see_little_is_trained_in_two_blocks(tmp_path, sites, expected):
-    views, points, visited = [], [], set()
+@pytest.mark.parametrize(("sites", "blocks"), [(2, 1), (20, 2)])
+def test_a_scene_of_which_views_see_little_is_trained_in_two_blocks(tmp_path, sites, blocks):
+    views, points = [], []
     for site in range(sites):
         away = torch.tensor([0.0, 20.0 * site, 0.0])  # cameras look along x
         points.append(torch.rand(40, 3, generator=torch.Generator().manual_seed(site)) - 0.5 + away)
@@ -136,14 +139,6 @@ def test_a_scene_of_which_views_see_little_is_trained_in_two_blocks(tmp_path, si
             viewmat[:3, 3] -= viewmat[:3, :3] @ away
             views.append(dataclasses.replace(view, viewmat=viewmat))
     photos, points = [torch.zeros(36, 48, 3)] * len(views), torch.cat(points)
-    options = RunOptions(training=TrainingConfig(warmup=0.0))
-    train(
-        views,
-        photos,
-        (points, torch.zeros_like(points)),
-        tmp_path / "out",
-        steps=400,
-        options=options,
-        listener=lambda event: visited.add(event.block) if isinstance(event, VisitEnded) else None,
-    )
-    assert visited == expected
+    train(views, photos, (points, torch.zeros_like(points)), tmp_path, steps=1)
+    with ParameterStore.open(tmp_path / STATE / STORE, read_only=True) as store:
+        assert BlockTree.from_json(store.header["tree"]).num_blocks == blocks

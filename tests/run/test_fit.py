@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.layer_renderer import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, coarse_model_size, degree_with_room, levels_of, limits_at
 from abcd_ns.engine.train.recipe import FULL
 from abcd_ns.errors import UserError
@@ -28,12 +29,13 @@ POINTS = 140_000
 
 
 def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = None, **training) -> Fit:
-    return find_fit(int(gb * GIB), Demand(pixels, points, training_config(**training), most=most))
+    density = DensityConfig(max_gaussians=most or 0)
+    return find_fit(int(gb * GIB), Demand(pixels, points, training_config(density=density, **training)))
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
-    waiting, degree = 0 if blocks == 1 else 3, 3 - fit.late_harmonics
-    options = {"crop_pixels": fit.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
+    waiting, degree = 0 if blocks == 1 else 3, 3 - fit.limits.late_harmonics
+    options = {"crop_pixels": fit.limits.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
     return DeviceNeeds(pixels, 1, **options, active_degree=degree)
 
 
@@ -46,16 +48,16 @@ def peak_of(needs: DeviceNeeds, gaussians: int) -> int:
 @pytest.mark.parametrize("gb", [4, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     fit = fit_for(gb, PIXELS, gaussians)
-    assert (fit.batch, fit.crop_pixels) == (1, 0)
-    for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
-        needs = needs_of(fit, PIXELS, blocks)
+    assert (fit.limits.batch_limit, fit.limits.crop_pixels) == (1, 0)
+    for blocks in (1, max(fit.blocks_at_the_end, 2)):
+        needs, limit = needs_of(fit, PIXELS, blocks), fit.limits.of_block(blocks)
         left = needs.left(gb * GIB)
         assert left == gb * GIB * (7 if blocks == 1 else 6) // 8
         assert peak_of(needs, limit) <= left < peak_of(needs, limit + 1)
-    assert (fit.blocks == 1) == (gaussians <= FULL * fit.sole)
+    assert (fit.blocks == 1) == (gaussians <= FULL * fit.limits.sole_limit)
     if fit.blocks > 1:
-        assert gaussians <= fit.blocks * FULL * fit.limit
-        assert fit.blocks == 2 or gaussians > (fit.blocks - 1) * FULL * fit.limit
+        assert gaussians <= fit.blocks * FULL * fit.limits.block_limit
+        assert fit.blocks == 2 or gaussians > (fit.blocks - 1) * FULL * fit.limits.block_limit
 
 
 @pytest.mark.parametrize(
@@ -70,10 +72,10 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
 )
 def test_large_photos_are_trained_on_by_parts(gb, pixels, whole):
     fit = fit_for(gb, pixels)
-    assert (fit.blocks, fit.crop_pixels == 0) == (1, whole)
-    assert min(fit.limit, fit.sole) > POINTS
-    for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
-        needs = needs_of(fit, pixels, blocks)
+    assert (fit.blocks, fit.limits.crop_pixels == 0) == (1, whole)
+    assert min(fit.limits.block_limit, fit.limits.sole_limit) > POINTS
+    for blocks in (1, max(fit.blocks_at_the_end, 2)):
+        needs, limit = needs_of(fit, pixels, blocks), fit.limits.of_block(blocks)
         assert peak_of(needs, limit) <= needs.left(int(gb * GIB))
     said = fit.in_words()
     assert "\n" not in said
@@ -86,7 +88,7 @@ def test_with_more_memory_no_less_is_drawn(pixels, points):
     drawn = []
     for gb in (8, 10, 12, 16, 24, 40, 60, 80):
         fit = fit_for(gb, pixels, points)
-        drawn.append(min(fit.crop_pixels or pixels, pixels))
+        drawn.append(min(fit.limits.crop_pixels or pixels, pixels))
     assert drawn == sorted(drawn)
     assert drawn[-1] == pixels
 
@@ -96,10 +98,10 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
         fit_for(12, GARDEN, 100_000, most=most, crop_pixels=4 * MP) for most in (5_000_000, 200_000_000)
     )
     assert many.blocks_at_the_end > few.blocks_at_the_end > 1
-    assert many.limit < few.limit
+    assert many.limits.block_limit < few.limits.block_limit
     needs = needs_of(many, GARDEN, many.blocks_at_the_end)
     assert needs.drawing_bytes > needs.step_bytes
-    assert peak_of(needs, many.limit) <= needs.left(12 * GIB)
+    assert peak_of(needs, many.limits.block_limit) <= needs.left(12 * GIB)
 
 
 @given(side=st.integers(100, 6000), batch=st.integers(1, 4))
@@ -112,9 +114,9 @@ def test_layers_that_are_folded_take_no_more_than_the_steps_that_follow(side, ba
 @pytest.mark.parametrize("blocks", [1, 2])
 def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
     fit = fit_for(8, PIXELS, 30_000_000)
-    training = training_config(**fit.limits)
+    training = training_config(**vars(fit.limits))
     growing, most = needs_of(fit, PIXELS, blocks), training.limits.of_block(blocks)
-    assert training.growing_degree == 3 - fit.late_harmonics < 3
+    assert training.growing_degree == 3 - fit.limits.late_harmonics < 3
     for degree in range(training.growing_degree + 1, 4):
         few = limits_at(training, degree).of_block(blocks)
         needs = dataclasses.replace(growing, active_degree=degree)
@@ -125,7 +127,7 @@ def test_a_block_at_its_limit_takes_as_much_with_more_harmonics(blocks):
 
 def test_as_many_harmonics_come_late_as_blocks_would_be_many():
     fits = [fit_for(8, PIXELS, millions * 10**6) for millions in (1, 10, 15, 300)]
-    assert [fit.late_harmonics for fit in fits] == [0, 0, 2, 3]
+    assert [fit.limits.late_harmonics for fit in fits] == [0, 0, 2, 3]
     assert [fit.blocks <= FEW for fit in fits] == [True, True, True, False]
     assert "Harmonics" not in fits[1].in_words()
     assert "Harmonics of the 2 highest degrees come after growth." in fits[2].in_words()
@@ -137,18 +139,18 @@ def test_a_cpu_keeps_layers_and_photos_under_another_budget():
     needs = dataclasses.replace(needs_of(cpu, PIXELS, cpu.blocks_at_the_end), keeps=False)
     assert needs.left(8 * GIB) == 8 * GIB
     assert (needs.layer_bytes(8 * GIB), needs.photo_bytes(8 * GIB)) == (0, 0)
-    assert peak_of(needs, cpu.limit) <= 8 * GIB < peak_of(needs, cpu.limit + 1)
-    assert cpu.limit > device.limit
+    assert peak_of(needs, cpu.limits.block_limit) <= 8 * GIB < peak_of(needs, cpu.limits.block_limit + 1)
+    assert cpu.limits.block_limit > device.limits.block_limit
 
 
 def test_what_is_set_is_kept():
-    assert fit_for(80, 2 * MP, crop_pixels=5000).crop_pixels == 5000
-    assert fit_for(80, 2 * MP, batch_limit=2).batch == 2
+    assert fit_for(80, 2 * MP, crop_pixels=5000).limits.crop_pixels == 5000
+    assert fit_for(80, 2 * MP, batch_limit=2).limits.batch_limit == 2
 
 
 def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
     fit = fit_for(0.3, 100_000, 2_000)
-    assert (fit.blocks, fit.limit, fit.blocks_at_the_end) == (1, 0, 1)
+    assert (fit.blocks, fit.limits.block_limit, fit.blocks_at_the_end) == (1, 0, 1)
     assert "no room for the layers" in fit.in_words()
     with pytest.raises(UserError):
         fit_for(0.3, 100_000, 2_000_000)

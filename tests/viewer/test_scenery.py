@@ -84,11 +84,6 @@ def test_views_that_see():
     assert views_that_see(torch.zeros(1, 3), views) == views
     assert views_that_see(torch.tensor([[0.0, 0.0, 1e4]]), views) == []
     assert views_that_see(torch.zeros(0, 3), views) == []
-    # Beside the first camera, and so behind it and in front of the one across.
-    beyond = views[0].center * 1.2
-    seen = {view.index for view in views_that_see(beyond[None], views)}
-    assert 0 not in seen
-    assert 4 in seen
     # A twentieth of the points suffices.
     behind = views[0].center * 2
     for count, found in ((19, views[:1]), (21, [])):

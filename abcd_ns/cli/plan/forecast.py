@@ -106,11 +106,12 @@ class Forecast:
     @property
     def quality(self) -> str | None:
         """What it costs that memory limits the scene, or cuts it into blocks; None where it does neither."""
-        fit, share = self.fit, self.fit.sole / max(self.fit.gaussians, 1)
+        limits, share = self.fit.limits, self.fit.limits.sole_limit / max(self.fit.gaussians, 1)
         if not 0 < share < 1:
             return None
-        if not fit.limit:
-            return f"limited to {fit.sole:,} Gaussians: there is no room for the layers of several blocks"
+        if not limits.block_limit:
+            most = f"limited to {limits.sole_limit:,} Gaussians"
+            return f"{most}: there is no room for the layers of several blocks"
         lost = min((lost for least, lost in LOST.items() if share >= least), default=None)
         found = f"up to {lost} dB in four small scenes, below" if lost else "not measured, below that of"
         return f"{found} one block with {1 / share:.1f} times this memory"
@@ -145,10 +146,11 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     points, views = capture.points, capture.views
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pixels = max(view.full.pixels for view in views)
-    most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
-    demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
+    on_cpu = device.type == "cpu"
+    training = replace(training, density=replace(training.density, max_gaussians=wanted.max_gaussians))
+    demand = Demand(pixels, len(points), training, factor=capture.factor, on_cpu=on_cpu)
     fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted, capture.seen)
-    training = replace(training, limits=replace(training.limits, **fit.limits))
+    training = replace(training, limits=fit.limits)
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
     counts = owner.bincount(minlength=fit.blocks)
@@ -180,8 +182,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
 def _fit(budget: int, demand: Demand, wanted: Wanted, seen: float) -> Fit:
     """As training has it: blocks whose number is given are as large as they become."""
     if wanted.blocks:
-        limits = demand.training.limits
-        return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, limits.crop_pixels, limits.batch_limit)
+        return Fit(wanted.blocks, budget, demand.gaussians, demand.training.limits)
     fit = find_fit(budget, demand, downscale="--downscale", memory="--device-budget-gb")
     workers = wanted.workers if wanted.workers > 1 else 0
     return replace(fit, blocks=blocks_to_begin_with(fit, workers, seen))
@@ -200,7 +201,7 @@ def shares_of(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> d
     RAM is beside Python and torch. A worker's machine caches what it was sent until that changes.
     """
     # The largest block, as far as can be said.
-    largest, limit = -(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit
+    largest, limit = -(-fit.gaussians // fit.blocks), fit.limits.of_block(fit.blocks)
     largest = min(largest, limit) if limit else largest
     scene, block = fit.gaussians * needs.parameter_bytes, largest * needs.parameter_bytes
     there_and_back, kept = 2 * STATES * block, RamShares.of(0)
@@ -279,7 +280,8 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         points = found.points_of_block
         rows["points by block"] = f"{min(points):,} to {max(points):,}, median {median(points):,.0f}"
         rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
-        rows["limits"] = fit.in_words() if fit.sole else "none of a block's Gaussians, as --blocks is given"
+        limited = fit.limits.sole_limit > 0
+        rows["limits"] = fit.in_words() if limited else "none of a block's Gaussians, as --blocks is given"
     print_facts(rows, console)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)

@@ -16,6 +16,7 @@ from abcd_ns.engine import events
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState, standing
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
+from abcd_ns.terminal import many
 from abcd_ns.units import GIB, bytes_in_words
 from abcd_ns.viewer.texts import clock, time_left
 
@@ -45,7 +46,7 @@ class ProgressReport:
         self._visit: events.VisitBegan | None = None
         self._workers: tuple[events.WorkerSeen, ...] = ()
         self._shown = time.monotonic()
-        self._live: Live | None = None
+        self._live = Live(console=CONSOLE, transient=True)
 
     def __call__(self, event: events.Event) -> None:
         """Take note of an event."""
@@ -90,12 +91,9 @@ class ProgressReport:
 
     def close(self) -> None:
         """Replace the live line by a summary of the run."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
+        self._live.stop()
         state = self._coordinator.state
-        steps = "1 step" if state.step == 1 else f"{state.step:,} steps"
-        visits = "1 visit" if state.visit == 1 else f"{state.visit} visits"
+        steps, visits = many(state.step, "step", "steps"), many(state.visit, "visit", "visits")
         seconds = clock(self._coordinator.stopwatch.seconds)
         say(f"Trained {steps} in {visits}, {seconds}: {self._summary()}.")
         lines = summary(self._coordinator.scene.tree.num_blocks, state)
@@ -135,9 +133,7 @@ class ProgressReport:
             self._print(f"  {'  '.join(parts)}")
             return
         self._shown = time.monotonic()
-        if self._live is None:
-            self._live = Live(console=CONSOLE, transient=True)
-            self._live.start()
+        self._live.start()
         columns = min(CONSOLE.width, shutil.get_terminal_size().columns)  # nerfstudio's width is always 120
         while len(parts) > 2 and len("  ".join(parts)) >= columns:
             parts.pop()

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +20,6 @@ from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA, Line, SampleLine, VisitEndLine
-from abcd_ns.run.store import Start
 
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
@@ -30,17 +29,10 @@ LINES_KEPT = 64  # lines that wait in memory for the end of a visit, at most
 
 class RunLog:
     """Listens to a coordinator and writes its events down. If the disk refuses, it says so once and ends.
-    `meters` are of what is kept in memory, by name: a function for the bytes in use, and their limit.
     `earlier` is the log of the run that is resumed; it may be the same."""
 
-    def __init__(
-        self,
-        coordinator: Trainer,
-        path: Path,
-        meters: Mapping[str, tuple[Callable[[], int], int]] | None = None,
-        earlier: Path | None = None,
-    ) -> None:
-        self._coordinator, self._meters = coordinator, meters or {}
+    def __init__(self, coordinator: Trainer, photos: Photos, path: Path, earlier: Path | None = None) -> None:
+        self._coordinator, self._photos = coordinator, photos
         self._path: Path | None = path
         self.visits: list[VisitEndLine] = []
         """Those that ended, of the whole run."""
@@ -57,10 +49,16 @@ class RunLog:
                     self._remember(KINDS[line.pop("kind")](**line))
             self._write(past, anew=True)
         self._sampled = coordinator.stopwatch.seconds
-        budgets = {name: limit for name, (_, limit) in self._meters.items()}
-        limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
-        scene = {"blocks": blocks, "gaussians": coordinator.count(), "limit": limit}
-        self._note("training", schema=SCHEMA, **scene, budgets=budgets, compiled_loss=fused.photometric.runs)
+        scene, limit = coordinator.scene, coordinator.config.density.limit
+        self._note(
+            "training",
+            schema=SCHEMA,
+            blocks=scene.tree.num_blocks,
+            gaussians=coordinator.count(),
+            limit=limit,
+            budgets=_kept(photos.budget_bytes, scene.ram_bytes, coordinator.layer_limit),
+            compiled_loss=fused.photometric.runs,
+        )
         self._flush()
 
     def __call__(self, event: events.Event) -> None:
@@ -106,15 +104,16 @@ class RunLog:
         self._flush()
 
     def _sample(self) -> None:
+        coordinator = self._coordinator
         self._note(
             "sample",
             psnr=_mean(self._psnrs),
-            gaussians=self._coordinator.count(),
+            gaussians=coordinator.count(),
             rss_bytes=psutil.Process().memory_info().rss,
             device_bytes=torch.cuda.memory_allocated() if torch.cuda.is_available() else None,
-            held={name: used() for name, (used, _) in self._meters.items()},
+            held=_kept(self._photos.cached_bytes, coordinator.scene.cached_bytes, coordinator.layer_bytes),
         )
-        self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
+        self._psnrs, self._sampled = [], coordinator.stopwatch.seconds
 
     def _note(self, kind: str, **fields: Any) -> None:
         now = {"step": self._coordinator.state.step, "seconds": round(self._coordinator.stopwatch.seconds, 3)}
@@ -165,16 +164,9 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
     return kept
 
 
-def keep_log(coordinator: Trainer, photos: Photos, folder: Path, resumed_from: Start | None) -> RunLog:
-    """Begin the log of a run in `folder`, with the past of the run that it resumes."""
-    scene = coordinator.scene
-    meters = {
-        "photos": (lambda: photos.cached_bytes, photos.budget_bytes),
-        "frozen blocks": (lambda: scene.cached_bytes, scene.ram_bytes),
-        "layers": (lambda: coordinator.layer_bytes, coordinator.layer_limit),
-    }
-    earlier = None if resumed_from is None else resumed_from.store.parent / LOG_FILE
-    return RunLog(coordinator, folder / LOG_FILE, meters, earlier)
+def _kept(photos: int, blocks: int, layers: int) -> dict[str, int]:
+    """Bytes of what is kept in memory, by name."""
+    return {"photos": photos, "frozen blocks": blocks, "layers": layers}
 
 
 def _finite(value: float | None) -> float | None:

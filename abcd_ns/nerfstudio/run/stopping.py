@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from abcd_ns.nerfstudio.flags import LOAD_CONFIG
+from abcd_ns.nerfstudio.flags import value_of
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 FORGOTTEN = ("--load-dir", "--load-step", "--load-checkpoint")
@@ -85,7 +85,7 @@ def command_to_resume(
     """The same command with --load-dir `folder`, and an option and its value `changed`; None if it is not
     `ns-train`'s, or takes no options beside a file's."""
     program, *words = argv
-    by_file = any(word.startswith(LOAD_CONFIG) for word in words)
+    by_file = value_of(words, "--load-config") is not None
     if by_file or Path(program).name != "ns-train" or words[:1] != [method]:
         return None
     kept, skip = list[str](), False
