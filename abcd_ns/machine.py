@@ -69,7 +69,7 @@ def describe_machine() -> Machine:
     import torch
 
     return Machine(
-        cpu=_cpu_model(),
+        cpu=cpuinfo("model name").split(":", 1)[-1].strip() or platform.machine(),
         cores=usable_cores(),
         torch_threads=threads_wanted(),
         ram_bytes=psutil.virtual_memory().total,
@@ -128,13 +128,11 @@ def disk_bytes(folder: Path) -> int:
     return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())
 
 
-def _cpu_model() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+def cpuinfo(*names: str) -> str:
+    """The first line of Linux' /proc/cpuinfo that begins with one of these, else the processor's name."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((line for line in lines if line.startswith(names)), platform.processor())
 
 
 def package_version(package: str) -> str | None:
