@@ -69,7 +69,7 @@ def describe_machine() -> Machine:
     import torch
 
     return Machine(
-        cpu=_proc_value("cpuinfo", "model name") or platform.processor() or platform.machine(),
+        cpu=proc_value("cpuinfo", "model name") or platform.processor() or platform.machine(),
         cores=usable_cores(),
         torch_threads=threads_wanted(),
         ram_bytes=psutil.virtual_memory().total,
@@ -101,7 +101,7 @@ def without_home(text: str) -> str:
 def peak_rss_bytes() -> int:
     """The most RAM that this process has held so far."""
     # Not getrusage: on Linux its ru_maxrss starts from the parent's peak, across fork and exec.
-    if (in_kib := _proc_value("self/status", "VmHWM")) is not None:
+    if (in_kib := proc_value("self/status", "VmHWM")) is not None:
         return int(in_kib.removesuffix("kB")) * 1024
     import resource
 
@@ -125,11 +125,11 @@ def disk_bytes(folder: Path) -> int:
     return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())
 
 
-def _proc_value(file: str, name: str) -> str | None:
-    """The first value of that name in a file of Linux' /proc; None on other systems."""
+def proc_value(file: str, *names: str) -> str | None:
+    """The first value of one of these names in a file of Linux' /proc; None on other systems."""
     path = Path("/proc", file)
     lines = path.read_text().splitlines() if path.exists() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), None)
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(names)), None)
 
 
 def package_version(package: str) -> str | None:

@@ -297,8 +297,7 @@ def _seen_by_torch() -> dict[str, Any]:
 
 def _kernels() -> dict[str, Any]:
     """The fields of Facts from `folder` on."""
-    from abcd_ns.engine.kernels import find_compiler, kernels_folder
-    from abcd_ns.engine.kernels.native import library_path
+    from abcd_ns.engine.kernels.native import find_compiler, kernels_folder, library_path
     from abcd_ns.engine.render import TorchRasterizer, self_check
     from abcd_ns.nerfstudio.metrics import lpips_missing
 

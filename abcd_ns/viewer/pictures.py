@@ -94,8 +94,8 @@ class BlockPictures:
         window = None
         if self.renderer.ownership == "fragments":
             options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
-            seen = [(self.view, self.view.full)]
-            (window,) = self.renderer.rasterizer.depth_windows(own, seen, **options)
+            shots = [Shot(self.view, self.view.full)]
+            (window,) = self.renderer.rasterizer.depth_windows(own, shots, **options)
         around = self._around(block, window)
         layer = around.front if show is Show.FRONT else around.back
         if show is Show.COMPOSITE:

@@ -8,8 +8,6 @@ from torch import Tensor
 class Counts:
     """What happened on the device."""
 
-    launches: int = 0
-    """Operations that ran there."""
     copies_to_host: int = 0
     """Of tensors; values that are read one by one are waits alone."""
     bytes_to_host: int = 0

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from tests.reference.simulated_device import kernel
 
+STAND_INS: dict[str, Callable] = {}
+"""By gsplat's names for them."""
+
 
 class Differentiable(torch.autograd.Function):
     """A kernel, and another for its gradient: torch's own of the same computation, which is done again."""
@@ -60,6 +63,7 @@ def stands_in(**fixed: Any) -> Callable[[Callable], Callable]:
             assert {name: given.pop(name) for name in fixed} == fixed
             return function(**given)
 
+        STAND_INS[function.__name__] = call
         return call
 
     return decorate

@@ -1,7 +1,7 @@
 """gsplat 1.4.0's CUDA functions in torch, under the names and with the signatures of `gsplat.cuda._wrapper`.
 
     with lent():
-        GsplatRasterizer()...  # on CPU tensors, or on the simulated device, where each counts as one launch
+        GsplatRasterizer()...  # on CPU tensors, or on the simulated device
 
 Gradients are right. As in CUDA, what is not drawn is left uninitialised: it is NaN here.
 Only what this package uses is there: projection by cameras, lists and pictures packed, no backgrounds.
@@ -17,23 +17,13 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from tests.reference.differentiable_kernel import Differentiable, stands_in
-from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs, surfel_sigma  # noqa: F401 - lent
+from tests.reference.differentiable_kernel import STAND_INS, Differentiable, stands_in
+from tests.reference.gsplat_surfel_stand_ins import surfel_sigma
 from tests.reference.simulated_device import kernel
 from tests.reference.triton_stand_ins import lent_triton
 
 LOG_STOP = math.log(1e-4)
 """Of the transmittance at which drawing stops."""
-NAMES = (
-    "fully_fused_projection",
-    "fully_fused_projection_2dgs",
-    "isect_offset_encode",
-    "isect_tiles",
-    "rasterize_to_pixels",
-    "rasterize_to_pixels_2dgs",
-    "spherical_harmonics",
-)
-"""What is stood in for."""
 
 
 @stands_in(covars=None, packed=False, sparse_grad=False, radius_clip=0.0, camera_model="pinhole")
@@ -243,7 +233,7 @@ def lent() -> Iterator[None]:
 
     with lent_triton(), pytest.MonkeyPatch.context() as patch:
         for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.render")]:
-            for name in NAMES:
+            for name, stand_in in STAND_INS.items():
                 if hasattr(module, name):
-                    patch.setattr(module, name, globals()[name])
+                    patch.setattr(module, name, stand_in)
         yield

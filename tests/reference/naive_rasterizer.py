@@ -22,8 +22,6 @@ class NaiveRaster:
     means2d: Tensor
     """[n, 2], of `gaussians` alone; in the graph."""
     radii: list[int]
-    fragments: int
-    """How many fragments passed all tests and were drawn."""
 
 
 def rotation(quat: Tensor) -> Tensor:
@@ -155,11 +153,9 @@ def _touches_tile(splat: _Splat, px: int, py: int) -> bool:
     return True
 
 
-def _pixel(
-    splats: list[_Splat], px: int, py: int, near: float, far: float
-) -> tuple[Tensor, Tensor, Tensor, int]:
+def _pixel(splats: list[_Splat], px: int, py: int, near: float, far: float) -> tuple[Tensor, Tensor, Tensor]:
     zero = torch.zeros((), dtype=torch.float64)
-    color, depth, T, drawn = torch.zeros(3, dtype=torch.float64), zero, zero + 1, 0
+    color, depth, T = torch.zeros(3, dtype=torch.float64), zero, zero + 1
     for splat in splats:
         if not _touches_tile(splat, px, py) or (splat.windowed and not near <= splat.depth.item() < far):
             continue
@@ -172,8 +168,7 @@ def _pixel(
         color = color + alpha * T * splat.color
         depth = depth + alpha * T * splat.depth
         T = T * (1 - alpha)
-        drawn += 1
-    return color, T, depth, drawn
+    return color, T, depth
 
 
 def naive_rasterize(
@@ -212,5 +207,4 @@ def naive_rasterize(
         depth.view(crop.height, crop.width),
         means2d,
         [0 if s is None else s.radius for s in own],
-        sum(p[3] for p in pixels),
     )

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.render import Raster, Rasterizer, Shot, ZWindow
-from abcd_ns.engine.render.projection import Splats, camera_numbers, project_in_torch
+from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 
 
@@ -36,10 +36,12 @@ def small_view(width: int = 37, height: int = 21, dtype: torch.dtype = torch.flo
     return View(viewmat, K, width, height).to(dtype)
 
 
-def project(gaussians: Gaussians, view: View, sh_degree: int = 0, antialiased: bool = False) -> Splats:
-    """As the torch rasterizer does, with gradients."""
-    camera = camera_numbers(view, gaussians.means, sh_degree, antialiased)
-    return Splats(project_in_torch(gaussians, [camera])[0])
+def random_window(grid: TileGrid, seed: int = 3, dtype: torch.dtype = torch.float64) -> ZWindow:
+    """Another range of z in each tile; about one in ten is empty."""
+    generator = torch.Generator().manual_seed(seed)
+    near, size = torch.rand(2, grid.tiles, generator=generator, dtype=torch.float64)
+    near, far = 4 * near + 1, 4 * near + 0.75 + 2.5 * size
+    return ZWindow(grid, near.to(dtype), far.to(dtype))
 
 
 def drawn(

@@ -13,10 +13,8 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, attach, nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
-from abcd_ns.engine.render import Rasterizer, ZWindow
+from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.z_window import TileGrid
-from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -38,11 +36,6 @@ from abcd_ns.lab.world.world import look_at
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 """So that runs of a few dozen steps grow."""
-
-
-def cell_windows(tree: BlockTree, view: View, grid: TileGrid, nodes, device="cpu") -> tuple[ZWindow, ...]:
-    """The intervals of camera z in which each tile's middle ray is in the boxes of these nodes."""
-    return tuple(ray_interval(tree.box(node), view, grid, device) for node in nodes)
 
 
 def random_gaussians(

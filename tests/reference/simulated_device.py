@@ -3,13 +3,12 @@
     with simulated_device() as counts:
         x = torch.zeros(3, device=DEVICE)
         x + torch.zeros(3)  # RuntimeError, as on CUDA: the tensors are on different devices
-    counts.launches, counts.waited, counts.copies_to_host, counts.peak_bytes, ...
+    counts.waited, counts.copies_to_host, counts.peak_bytes, ...
 
 Tensors on `DEVICE` cannot be mixed with CPU tensors where CUDA would refuse it, through autograd, optimizers
-and custom functions alike; what costs time on any accelerator is counted: operations launched, points where
-the host waits for the device, and copies between the two. It says nothing about seconds. An operation is one
-launch here, whatever number of kernels CUDA would take for it, and views are none. `live_bytes` are those of
-the tensors alone: no allocator's rounding and reserve, and no memory that a CUDA kernel takes for itself.
+and custom functions alike; what costs time on any accelerator is counted: points where the host waits for
+the device, and copies between the two. It says nothing about seconds. `live_bytes` are those of the tensors
+alone: no allocator's rounding and reserve, and no memory that a CUDA kernel takes for itself.
 
 Kernels that exist for CUDA only are stood in for by functions under `kernel`, see gsplat_stand_ins. Random
 numbers on the device come from the CPU's generator.
@@ -22,7 +21,6 @@ import functools
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -81,7 +79,6 @@ INDEXING = {"_index_put_impl_", "_unsafe_index", "index", "index_put", "index_pu
 TAKES_CPU_SCALARS = {*INDEXING, "fill_", "fill", "masked_fill", "masked_fill_"}
 """Operations, beside the pointwise ones, whose operands may be 0-dimensional CPU tensors. A fused Adam is
 none: its kernel reads `step` by address."""
-ALLOCATES = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"}
 
 
 _counts = Counts()
@@ -160,20 +157,9 @@ class OnDevice(torch.Tensor):
         return _run(func, args, kwargs or {})
 
 
-@dataclass(frozen=True)
-class _Traits:
-    """What matters about an operation."""
-
-    name: str
-    launches: bool
-    takes_cpu_scalars: bool
-
-
 @functools.cache
-def _traits(func: Any) -> _Traits:
-    name = func._schema.name.removeprefix("aten::")
-    pointwise = torch.Tag.pointwise in func.tags
-    return _Traits(name, not func.is_view and name not in ALLOCATES, pointwise or name in TAKES_CPU_SCALARS)
+def _name_of(func: Any) -> str:
+    return func._schema.name.removeprefix("aten::")
 
 
 def _inner(value: Any) -> Any:
@@ -205,10 +191,10 @@ def _is_device(device: Any) -> bool:
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     """An operation as torch dispatches it, on CPU tensors, on device tensors, or between them."""
-    traits = _traits(func)
-    if traits.name == "_to_copy":
+    name = _name_of(func)
+    if name == "_to_copy":
         return _to_copy(func, args[0], **kwargs)
-    if traits.name == "copy_" and isinstance(args[0], OnDevice) != isinstance(args[1], OnDevice):
+    if name == "copy_" and isinstance(args[0], OnDevice) != isinstance(args[1], OnDevice):
         to_device = isinstance(args[0], OnDevice)
         _counts.move(args[1], to_device=to_device, blocks=not (to_device and _non_blocking(args, kwargs)))
         func(_inner(args[0]), _inner(args[1]), *args[2:], **kwargs)
@@ -217,14 +203,13 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     here = [x for x in tensors if isinstance(x, OnDevice)]
     if not here and not _is_device(kwargs.get("device")):
         return func(*args, **kwargs)
-    _check_places(traits, tensors, here)
+    _check_places(func, tensors, here)
     _check_generator(kwargs.get("generator"))
-    _counts.launches += traits.launches
-    if _waits(traits.name, args, kwargs):
-        _counts.wait(traits.name)
+    if _waits(name, args, kwargs):
+        _counts.wait(name)
     if kwargs.get("device") is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
-    result = func(*_map(_inner, args), **{name: _map(_inner, value) for name, value in kwargs.items()})
+    result = func(*_map(_inner, args), **{key: _map(_inner, value) for key, value in kwargs.items()})
     return _wrapped(result, here)
 
 
@@ -247,22 +232,22 @@ def _wrapped(result: Any, given: list[OnDevice]) -> Any:
     return _map(wrap, result)
 
 
-def _check_places(traits: _Traits, tensors: list[Tensor], here: list[OnDevice]) -> None:
+def _check_places(func: Any, tensors: list[Tensor], here: list[OnDevice]) -> None:
     """Refuse what CUDA would refuse.
 
     Raises:
         RuntimeError: some tensors are on the CPU that must be on the device.
     """
+    name = _name_of(func)
+    takes_scalars = torch.Tag.pointwise in func.tags or name in TAKES_CPU_SCALARS
     for x in tensors:
         if isinstance(x, OnDevice):
             continue
-        if traits.name in INDEXING and not x.dtype.is_floating_point and here:
+        if name in INDEXING and not x.dtype.is_floating_point and here:
             _counts.move(x, to_device=True)  # indices are copied to where they are needed
-        elif x.dim() > 0 or not traits.takes_cpu_scalars:
+        elif x.dim() > 0 or not takes_scalars:
             shapes = [(str(t.device), tuple(t.shape)) for t in tensors]
-            raise RuntimeError(
-                f"Expected all tensors to be on the same device: aten::{traits.name} of {shapes}"
-            )
+            raise RuntimeError(f"Expected all tensors to be on the same device: aten::{name} of {shapes}")
 
 
 def _check_generator(generator: torch.Generator | None) -> None:
@@ -294,8 +279,6 @@ def _to_copy(
             Event._underway.append((copied, values))
         elif not to_device:
             _arrive(Event._underway)  # the device works in order
-    elif to_device:
-        _counts.launches += 1
     return OnDevice(copied) if to_device else copied
 
 
@@ -314,7 +297,6 @@ def kernel(compute: Callable[..., Any], *tensors: Tensor, waits: int = 0) -> Any
     if len(here) < len(tensors):
         shapes = [(str(t.device), tuple(t.shape)) for t in tensors]
         raise RuntimeError(f"a kernel was given the address of a tensor of the host: {shapes}")
-    _counts.launches += 1
     for _ in range(waits):
         _counts.wait(compute.__name__.strip("_"))
     with _disable_current_modes():

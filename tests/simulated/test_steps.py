@@ -168,7 +168,8 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(on_device, photos):
 
 def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(on_device, photos, simulated_gsplat):
     """Rows are looked at one by one for a while, and steps that six optimizers count once are counted on."""
-    coordinator = on_device(blocks=1, steps=LATE_AFTER + 12, density=GATHERING)
+    options = {"density": GATHERING, "commit_seconds": 3600.0}  # a commit waits, too
+    coordinator = on_device(blocks=1, steps=LATE_AFTER + 12, **options)
     spoil_once(coordinator, 3)
     waits = []
     for _ in range(LATE_AFTER + 10):

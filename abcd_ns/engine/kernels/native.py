@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from abcd_ns.machine import threads_wanted
+from abcd_ns.machine import proc_value, threads_wanted
 
 FOLDER_VARIABLE = "ABCD_KERNELS"
 """Environment variable that names another folder for the compiled library."""
@@ -62,7 +62,9 @@ def find_compiler() -> str | None:
 def library_path() -> Path:
     """Where the library is or would be: a name made of all that the code depends on."""
     digest = hashlib.blake2b(digest_size=10)
-    for part in (platform.machine(), _instructions(), find_compiler() or "", *FLAGS):
+    # Code made for some instructions does not run on a processor of others.
+    instructions = proc_value("cpuinfo", "flags", "Features") or platform.processor()
+    for part in (platform.machine(), instructions, find_compiler() or "", *FLAGS):
         digest.update(part.encode() + b"\0")
     for source in sorted(SOURCES.iterdir()):
         digest.update(source.read_bytes())
@@ -136,12 +138,3 @@ def _compile(path: Path) -> None:
 def _first_line(reason: str) -> str:
     lines = [line for line in reason.splitlines() if line.strip()]
     return next((line for line in lines if "error" in line), lines[0] if lines else "no reason given")
-
-
-def _instructions() -> str:
-    """The processor's instruction sets: code made for one may not run on another."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())

@@ -206,7 +206,7 @@ class LayerRenderer:
         for one in seen:
             crop = loaded.crops[one.view.index]
             span, window = self.span(node, one.view, crop), one.window.on(self.rasterizer.window_grid(crop))
-            shots.append(CutShot(one.view, crop, span.before(window), window, span.behind(window)))
+            shots.append(CutShot(one.view, crop, *span.cut_by(window)))
         others = loaded.own < len(loaded.gaussians)
         cuts = self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings))
         for cut, shot in zip(cuts, shots, strict=True):

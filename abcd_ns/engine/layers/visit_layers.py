@@ -17,7 +17,7 @@ from abcd_ns.engine.layers.layer_renderer import (
     Visible,
 )
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.render import ZWindow
+from abcd_ns.engine.render import Shot, ZWindow
 from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -151,9 +151,9 @@ class VisitLayers:
         if self._own is None:
             return
         new = [view for view in views if view not in self._windows]
-        seen = [(self._views[view], self._geometry.crops[view]) for view in new]
+        shots = [Shot(self._views[view], self._geometry.crops[view]) for view in new]
         own, options = self._own.to(self._renderer.device), {"antialiased": self._settings.antialiased}
-        found = self._renderer.rasterizer.depth_windows(own, seen, visible=self._window_weight, **options)
+        found = self._renderer.rasterizer.depth_windows(own, shots, visible=self._window_weight, **options)
         self._windows.update(zip(new, found, strict=True))
 
     def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:

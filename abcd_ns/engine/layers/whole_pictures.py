@@ -24,7 +24,7 @@ from abcd_ns.engine.layers.layer_renderer import (
     Shown,
     drawn_over,
 )
-from abcd_ns.engine.render import Raster
+from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.base import runs
 from abcd_ns.engine.types import View
 
@@ -42,7 +42,8 @@ class WholePictures:
     def groups(self, views: Sequence[View]) -> list[list[View]]:
         """Views whose layers have room at the same time: each group reads the scene twice."""
         pixels = self._layers_bytes // (len(self._nodes) * BYTES_PER_PIXEL)
-        return list(runs(views, [view.full for view in views], pixels))
+        shots = [Shot(view, view.full) for view in views]
+        return [[shot.view for shot in run] for run in runs(shots, pixels)]
 
     @torch.no_grad()
     def draw(self, views: Sequence[View]) -> Iterator[Raster]:

@@ -13,7 +13,6 @@ from abcd_ns.engine.render.projection import Primitive, Splats, extents_of
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
-Item = TypeVar("Item")
 DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
 """Of the views that an accelerator draws together, at most, unless a single view has more."""
 SUMS = 10
@@ -74,6 +73,9 @@ class CutShot:
     front: ZWindow
     inside: ZWindow
     back: ZWindow
+
+
+AnyShot = TypeVar("AnyShot", Shot, CutShot)
 
 
 @dataclass(frozen=True)
@@ -205,44 +207,37 @@ class Rasterizer:
         gradients. Drawn as they are asked for, a few at a time."""
 
     def depth_windows(
-        self,
-        gaussians: Gaussians,
-        seen: Sequence[tuple[View, Crop]],
-        *,
-        visible: float,
-        antialiased: bool = False,
+        self, gaussians: Gaussians, shots: Sequence[Shot], *, visible: float, antialiased: bool = False
     ) -> Iterator[ZWindow]:
-        """For each crop the range of camera z, in each of its tiles, in which the Gaussians show, with
+        """For each shot's crop the range of camera z, in each of its tiles, in which the Gaussians show, with
         nothing else in the scene; no gradients. See z_window.showing."""
 
 
 def runs(
-    items: Sequence[Item],
-    crops: Sequence[Crop],
+    shots: Sequence[AnyShot],
     pixels: int = DEVICE_PIXELS,
     *,
     gaussians: int = 0,
     splats: int = DEVICE_SPLATS,
     padded: bool = False,
-) -> Iterator[list[Item]]:
-    """The items, a crop each, in runs of neighbours.
+) -> Iterator[list[AnyShot]]:
+    """The shots in runs of neighbours.
 
     Args:
         pixels: most of a run of more than one.
-        gaussians: that are drawn in each crop, if they are limited, too.
-        splats: most of these in all crops of a run of more than one.
+        gaussians: that are drawn in each shot, if they are limited, too.
+        splats: most of these in a run of more than one.
         padded: each crop is drawn as large as the largest of its run.
     """
-    run: list[Item] = []
-    taken: list[Crop] = []
-    for item, crop in zip(items, crops, strict=True):
-        taken.append(crop)
-        drawn = sum(each.pixels for each in taken)
+    run: list[AnyShot] = []
+    for shot in shots:
+        crops = [each.crop for each in (*run, shot)]
+        drawn = sum(crop.pixels for crop in crops)
         if padded:
-            drawn = len(taken) * max(each.width for each in taken) * max(each.height for each in taken)
-        if run and (drawn > pixels or (len(run) + 1) * gaussians > splats):
+            drawn = len(crops) * max(crop.width for crop in crops) * max(crop.height for crop in crops)
+        if run and (drawn > pixels or len(crops) * gaussians > splats):
             yield run
-            run, taken = [], [crop]
-        run.append(item)
+            run = []
+        run.append(shot)
     if run:
         yield run

@@ -108,13 +108,10 @@ class ZWindow:
         infinity = torch.full((grid.tiles,), math.inf, device=device, dtype=dtype)
         return ZWindow(grid, -infinity, infinity)
 
-    def before(self, other: "ZWindow") -> "ZWindow":
-        """The part of this window in front of another one."""
-        return ZWindow(self.grid, self.near, torch.minimum(self.far, other.near))
-
-    def behind(self, other: "ZWindow") -> "ZWindow":
-        """The part of this window behind another one."""
-        return ZWindow(self.grid, torch.maximum(self.near, other.far), self.far)
+    def cut_by(self, other: "ZWindow") -> tuple["ZWindow", "ZWindow", "ZWindow"]:
+        """The part of this window in front of another one, that one, and the part behind it."""
+        front = ZWindow(self.grid, self.near, torch.minimum(self.far, other.near))
+        return front, other, ZWindow(self.grid, torch.maximum(self.near, other.far), self.far)
 
     def on(self, grid: TileGrid) -> "ZWindow":
         """The same window on the tiles of a crop of this crop.
@@ -167,7 +164,8 @@ def showing(
     crops, tiles = pixels.shape
     ends = torch.searchsorted(tile, torch.arange(crops * tiles, device=tile.device), right=True)
     share = weight.to(finest(weight.device)) / pixels.flatten().clamp_min(1).index_select(0, tile)
-    so_far, mass = _from_zero(share), _from_zero(share * z)
+    # Sums of the first 0, 1, 2, ... pairs.
+    so_far, mass = (F.pad(values.cumsum(0), (1, 0)) for values in (share, share * z))
     starts = torch.cat((ends.new_zeros(1), ends[:-1]))
     before, after = so_far[starts], so_far[ends]
     # With what is in front of each pair, and with what is behind it; rounding must not lose any at 0.
@@ -194,8 +192,3 @@ def window_between(
     last = torch.nextafter(last, torch.full_like(last, math.inf))
     midst = torch.where(held > 0, of_z / held, of_z.sum(1, keepdim=True) / held.sum(1, keepdim=True))
     return torch.where(empty, midst.nan_to_num(0.0).to(near), torch.stack((first, last)))
-
-
-def _from_zero(values: Float[Tensor, "q"]) -> Float[Tensor, "q+1"]:
-    """Sums of the first 0, 1, 2, ... values."""
-    return torch.cat((values.new_zeros(1), values.cumsum(0)))

@@ -107,8 +107,7 @@ def in_passes(gaussians: Gaussians, small: Sequence[View]) -> Iterator[list[Shot
     """Small images, whole, in runs that are best drawn at once. An accelerator is waited for once in each."""
     splats = AT_ONCE if gaussians.device.type == "cpu" else DEVICE_SPLATS
     shots = [Shot(view, view.full) for view in small]
-    crops = [shot.crop for shot in shots]
-    return runs(shots, crops, gaussians=len(gaussians), splats=splats, padded=True)
+    return runs(shots, gaussians=len(gaussians), splats=splats, padded=True)
 
 
 class InfluenceTable:

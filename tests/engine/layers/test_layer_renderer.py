@@ -53,14 +53,11 @@ def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians
     return gaussians
 
 
-def cut(kind: str, means: torch.Tensor) -> BlockTree:
-    match kind:
-        case "kd":
-            return build_kd(means, 7)
-        case "thin":
-            return build_grid(means, counts=(6, 1, 1))
-        case _:  # some cells hold nothing
-            return build_grid(means, counts=(2, 2, 2)).split(0, axis=2, threshold=-50.0)
+CUTS = {
+    "kd": lambda means: build_kd(means, 7),
+    "thin": lambda means: build_grid(means, counts=(6, 1, 1)),
+    "some empty": lambda means: build_grid(means, counts=(2, 2, 2)).split(0, axis=2, threshold=-50.0),
+}
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,7 @@ def cut(kind: str, means: torch.Tensor) -> BlockTree:
         ("3dgs", torch.float64, 1e-12, 4, "kd", 40),
         ("3dgs", torch.float64, 1e-12, 16, "thin", 1000),
         ("3dgs", torch.float32, 1e-6, 4, "kd", 0),
-        ("2dgs", torch.float64, 1e-12, 4, "grid", 0),
+        ("2dgs", torch.float64, 1e-12, 4, "some empty", 0),
         ("2dgs", torch.float64, 1e-12, 16, "thin", 0),
     ],
 )
@@ -79,7 +76,7 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(
 ):
     """With oversized Gaussians, and some far away that reach into many cells."""
     gaussians = translucent(100, 0.12, dtype)
-    tree = cut(kind, gaussians.means)
+    tree = CUTS[kind](gaussians.means)
     gaussians.scales[:3] = math.log(1.5)
     gaussians.means[3:6] *= 40.0
     gaussians.scales[3:6] = math.log(8.0)
@@ -123,7 +120,7 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
     for view in views:
         windows = [
             ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
-            next(draw.depth_windows(own, [(view, view.full)], visible=0.05)),
+            next(draw.depth_windows(own, [Shot(view, view.full)], visible=0.05)),
         ]
         for window in windows:
             seen = Seen(view, view.full, window)

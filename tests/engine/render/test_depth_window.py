@@ -50,7 +50,7 @@ def test_what_the_window_leaves_out_on_either_side_weighs_less_than_said(seed):
     weights, z = means_of_tiles(weights), z[:, None, None]
     infinity = torch.tensor(math.inf, dtype=torch.float64)
     for visible in (0.002, 0.02, 0.1):
-        window = next(DRAW.depth_windows(gaussians, [(view, view.full)], visible=visible))
+        window = next(DRAW.depth_windows(gaussians, [Shot(view, view.full)], visible=visible))
         near = window.near.view(weights.shape[1:])
         far = window.far.view(weights.shape[1:])
         assert float((weights * (z < near)).sum(dim=0).max()) < visible + STOP
@@ -66,14 +66,14 @@ def test_what_the_window_leaves_out_on_either_side_weighs_less_than_said(seed):
 
 def test_where_nothing_shows_the_window_is_empty_and_in_the_midst():
     gaussians, view = scene(0, n=3, size=0.02)
-    window = next(DRAW.depth_windows(gaussians, [(view, view.full)], visible=0.01))
+    window = next(DRAW.depth_windows(gaussians, [Shot(view, view.full)], visible=0.01))
     z = DRAW.project(gaussians, view).depths
     empty = window.near >= window.far
     assert 0.5 < float(empty.double().mean()) < 1
     assert bool((window.near[empty] == window.far[empty]).all())
     midst = window.near[empty]
     assert float(z.min()) - 1e-9 < float(midst.min()) <= float(midst.max()) < float(z.max()) + 1e-9
-    nobody = next(DRAW.depth_windows(gaussians[:0], [(view, Crop(3, 5, 20, 9))], visible=0.0))
+    nobody = next(DRAW.depth_windows(gaussians[:0], [Shot(view, Crop(3, 5, 20, 9))], visible=0.0))
     assert nobody.near.shape == (nobody.grid.tiles,)
     assert bool((nobody.near == nobody.far).all())
 
@@ -81,7 +81,7 @@ def test_where_nothing_shows_the_window_is_empty_and_in_the_midst():
 def test_tiles_that_stick_out_of_the_crop_count_their_own_pixels():
     gaussians, view = scene(5)
     visible, crop = 0.2, Crop(0, 0, 32, 21)  # the last row of tiles has a single row of pixels
-    window = next(DRAW.depth_windows(gaussians, [(view, crop)], visible=visible))
+    window = next(DRAW.depth_windows(gaussians, [Shot(view, crop)], visible=visible))
     shows = (window.near < window.far).view(6, 8)[-1]
     weights, _ = weights_by_hand(gaussians, view)
     total = weights.sum(dim=0)[20].view(8, SIDE).mean(dim=1)
@@ -96,17 +96,17 @@ def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypat
     monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.SPLATS_AT_ONCE", at_once[1])
     draw = TorchRasterizer(use_native=use_native)
     views = ring_of_views(5, width=32, height=24)
-    seen = [(view, Crop(k, 2 * k, 12 + 4 * k, 9 + 2 * k)) for k, view in enumerate(views)]
+    seen = [Shot(view, Crop(k, 2 * k, 12 + 4 * k, 9 + 2 * k)) for k, view in enumerate(views)]
     active, frozen = random_gaussians(30, seed=1), random_gaussians(60, seed=2)
     windows = list(draw.depth_windows(active, seen, visible=0.02))
-    assert [window.grid for window in windows] == [draw.window_grid(crop) for _, crop in seen]
+    assert [window.grid for window in windows] == [draw.window_grid(shot.crop) for shot in seen]
     shots = []
-    for (view, crop), window in zip(seen, windows, strict=True):
-        alone = next(draw.depth_windows(active, [(view, crop)], visible=0.02))
+    for shot, window in zip(seen, windows, strict=True):
+        alone = next(draw.depth_windows(active, [shot], visible=0.02))
         assert torch.equal(window.near, alone.near)
         assert torch.equal(window.far, alone.far)
         span = ZWindow.everything(window.grid, "cpu", torch.float32)
-        shots.append(CutShot(view, crop, span.before(window), window, span.behind(window)))
+        shots.append(CutShot(shot.view, shot.crop, *span.cut_by(window)))
     for cut, shot in zip(draw.cuts(frozen, shots, sh_degree=1), shots, strict=True):
         (alone,) = draw.cuts(frozen, [shot], sh_degree=1)
         assert torch.equal(cut.kept_ids, alone.kept_ids)

@@ -9,13 +9,13 @@ from abcd_ns.engine.render import CutShot, Rasterizer, Shot, TorchRasterizer, ZW
 from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.render.cuda.pairs import TILE
-from abcd_ns.engine.render.z_window import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.rasterizer_scenes import (
     as_leaves,
     probe,
     random_gaussians,
+    random_window,
     relative_error,
     small_view,
     stacked,
@@ -47,12 +47,6 @@ def test_the_gradient_of_a_pose_equals_the_torch_backends(backend):
     assert relative_error(*found) < 1e-8
 
 
-def window_for(crop: Crop, seed: int = 3) -> ZWindow:
-    grid, generator = TileGrid(crop, TILE), torch.Generator().manual_seed(seed)
-    near, size = torch.rand(2, grid.tiles, generator=generator, dtype=torch.float64)
-    return ZWindow(grid, 4 * near + 1, 4 * near + 1 + 3 * size)
-
-
 def moved(view: View, by: float = 0.0, **changes) -> View:
     viewmat = view.viewmat.clone()
     viewmat[0, 3] += by
@@ -68,7 +62,8 @@ def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
     for k, (view, crop) in enumerate(zip(views, crops, strict=True)):
         frozen = random_gaussians((0, 9, 12, 5, 3)[k], seed=k)
         seen = backend.project(frozen, view) if with_frozen and k < 4 else None
-        shots.append(Shot(view, crop, seen, window_for(crop, k) if windowed and k != 2 else None))
+        window = random_window(backend.window_grid(crop), k) if windowed and k != 2 else None
+        shots.append(Shot(view, crop, seen, window))
     return shots
 
 
@@ -116,21 +111,21 @@ def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
 def test_depth_windows_and_cuts_of_several_views_are_the_torch_backends(backend):
     gaussians, draws = random_gaussians(60), (backend, torch_twin(backend, TILE))
     seen = [
-        (VIEW, VIEW.full),
-        (moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
-        (moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
+        Shot(VIEW, VIEW.full),
+        Shot(moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
+        Shot(moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
     ]
     windows = (draw.depth_windows(gaussians, seen, visible=0.1) for draw in draws)
     for found, expected in zip(*windows, strict=True):
         assert found.grid == expected.grid
         torch.testing.assert_close((found.near, found.far), (expected.near, expected.far))
     shots = []
-    for view, crop in seen:
-        window = window_for(crop)
+    for shot in seen:
+        window = random_window(backend.window_grid(shot.crop))
         every = ZWindow.everything(window.grid, "cpu", torch.float64)
-        shots.append(CutShot(view, crop, every.before(window), window, every.behind(window)))
+        shots.append(CutShot(shot.view, shot.crop, *every.cut_by(window)))
     cuts = (draw.cuts(gaussians, shots, sh_degree=1) for draw in draws)
-    for found, expected, (view, _) in zip(*cuts, seen, strict=True):
+    for found, expected, shot in zip(*cuts, seen, strict=True):
         for side in ("front", "back"):
             one, other = getattr(found, side), getattr(expected, side)
             torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
@@ -138,14 +133,14 @@ def test_depth_windows_and_cuts_of_several_views_are_the_torch_backends(backend)
         # gsplat's lists are longer: they hold what the square of the radius touches, drawn there or not.
         assert set(expected.kept_ids.tolist()) <= set(found.kept_ids.tolist())
         assert torch.equal(found.kept_ids, found.kept_ids.unique())
-        depths = backend.project(gaussians, view).depths[found.kept_ids]
+        depths = backend.project(gaussians, shot.view).depths[found.kept_ids]
         torch.testing.assert_close(found.inside.depths, depths)
 
 
 def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
     """A block whose last Gaussian was pruned is drawn until its visit ends."""
     nobody = Gaussians.empty(1, dtype=torch.float64)
-    window = next(backend.depth_windows(nobody, [(VIEW, Crop(16, 0, 32, 20))], visible=0.06))
+    window = next(backend.depth_windows(nobody, [Shot(VIEW, Crop(16, 0, 32, 20))], visible=0.06))
     assert bool((window.near == window.far).all())
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2

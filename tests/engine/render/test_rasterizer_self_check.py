@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from abcd_ns.engine.kernels import library
+from abcd_ns.engine.kernels.native import library
 from abcd_ns.engine.render import TorchRasterizer, self_check
 from abcd_ns.engine.render.self_check import TOLERANCE
 from abcd_ns.engine.types import Crop, Gaussians
@@ -72,6 +72,7 @@ def test_a_sound_backend_passes():
         assert self_check(TorchRasterizer(use_native=False), "cpu") == 0.0
     if library() is not None:  # close, and not the very same
         assert 0 < self_check(TorchRasterizer(), "cpu") < 1e-4
+        assert 0 < self_check(TorchRasterizer(primitive="2dgs"), "cpu") < 5e-4
 
 
 @pytest.mark.parametrize(

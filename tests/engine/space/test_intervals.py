@@ -16,7 +16,6 @@ from abcd_ns.engine.space.intervals import ray_directions, ray_interval
 from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.types import Crop, View
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
-from tests.reference.scenes import cell_windows
 
 DTYPES = st.sampled_from([torch.float32, torch.float64])
 
@@ -56,7 +55,7 @@ def pixels(view: View) -> TileGrid:
 
 def leaf_windows(tree: BlockTree, view: View) -> tuple[torch.Tensor, torch.Tensor]:
     """near and far of all blocks, [K, h, w]."""
-    windows = cell_windows(tree, view, pixels(view), [tree.node_of(b) for b in range(tree.num_blocks)])
+    windows = [ray_interval(tree.cell(block), view, pixels(view)) for block in range(tree.num_blocks)]
     near, far = torch.stack([w.near for w in windows]), torch.stack([w.far for w in windows])
     return near.view(-1, view.height, view.width), far.view(-1, view.height, view.width)
 

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
+from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import ALIGN, Sample, part_to_draw, random_part
 from abcd_ns.engine.types import Crop, View
-from tests.reference.rasterizer_scenes import project
 from tests.reference.scenes import STILL, assert_resumes, random_gaussians, ring_of_views, training_config
 
 CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
@@ -151,7 +151,7 @@ def test_a_reduced_camera_sees_the_same_in_larger_pixels(by):
     gaussians = random_gaussians(20).to(torch.float64)
     small = view.reduced(by)
     assert (small.width, small.height, small.reduction) == (50 // by, 36 // by, by)
-    found, full = project(gaussians, small), project(gaussians, view)
+    found, full = (TorchRasterizer().project(gaussians, each) for each in (small, view))
     torch.testing.assert_close(found.means2d * by, full.means2d)
     torch.testing.assert_close(found.depths, full.depths)
 

@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.kernels import library
-from abcd_ns.engine.kernels.native import suits
-from abcd_ns.engine.render.base import Cut, CutShot, Item, Raster, Rasterizer, Shot, runs
+from abcd_ns.engine.kernels.native import library, suits
+from abcd_ns.engine.render.base import AnyShot, Cut, CutShot, Raster, Rasterizer, Shot, runs
 from abcd_ns.engine.render.cpu import native, reference
 from abcd_ns.engine.render.projection import (
     PRIMITIVES,
@@ -100,7 +99,7 @@ class TorchRasterizer(Rasterizer):
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
-        for few in _a_few(shots, [shot.crop for shot in shots], gaussians):
+        for few in _a_few(shots, gaussians):
             planes = self._project(gaussians, [shot.view for shot in few], sh_degree, antialiased)
             lists = self._lists(gaussians, _each_a_picture(planes), [shot.crop for shot in few])
             kept = lists.kept_ids([shot.inside for shot in few]).view(len(few), len(gaussians))
@@ -112,17 +111,12 @@ class TorchRasterizer(Rasterizer):
 
     @torch.no_grad()
     def depth_windows(
-        self,
-        gaussians: Gaussians,
-        seen: Sequence[tuple[View, Crop]],
-        *,
-        visible: float,
-        antialiased: bool = False,
+        self, gaussians: Gaussians, shots: Sequence[Shot], *, visible: float, antialiased: bool = False
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows. A few views are drawn in one pass."""
-        for few in _a_few(seen, [crop for _, crop in seen], gaussians):
-            views, crops = zip(*few, strict=True)
-            planes = self._project(gaussians, views, 0, antialiased)
+        for few in _a_few(shots, gaussians):
+            crops = [shot.crop for shot in few]
+            planes = self._project(gaussians, [shot.view for shot in few], 0, antialiased)
             shown = self._lists(gaussians, _each_a_picture(planes), crops).shown(visible)
             for crop, ends in zip(crops, shown, strict=True):
                 yield ZWindow(self.window_grid(crop), *ends)
@@ -174,8 +168,8 @@ class TorchRasterizer(Rasterizer):
         return reference.find_lists(parts, crops, self.primitive, windows, self.tile_side)
 
 
-def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -> Iterator[list[Item]]:
-    return runs(items, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE)
+def _a_few(shots: Sequence[AnyShot], gaussians: Gaussians) -> Iterator[list[AnyShot]]:
+    return runs(shots, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE)
 
 
 def _each_a_picture(planes: Float[Tensor, "v r n"]) -> list[native.Part]:

@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.base import Cut, CutShot, Item, Raster, Rasterizer, ResidualSums, Shot, runs
+from abcd_ns.engine.render.base import AnyShot, Cut, CutShot, Raster, Rasterizer, ResidualSums, Shot, runs
 from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, FlatSplats
 from abcd_ns.engine.render.cuda.projection import kind_of, place_on_screen, project
 from abcd_ns.engine.render.projection import PRIMITIVES, PrimitiveName, Splats, extents_of
 from abcd_ns.engine.render.z_window import ZWindow
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Gaussians, View
 
 FOOTPRINT_BYTES = 256 << 20
 """Of what is projected into several views at once, to see where they see it."""
@@ -83,7 +83,7 @@ class GsplatRasterizer(Rasterizer):
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and sorted once, and a few are drawn in one pass."""
-        for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
+        for few in _a_few(shots, gaussians):
             views, crops = [shot.view for shot in few], [shot.crop for shot in few]
             seen = project(self._kind, gaussians, views, sh_degree, antialiased)
             drawing = Drawing.of(self._kind, FlatSplats.of(seen), crops, windowed=True)
@@ -95,17 +95,11 @@ class GsplatRasterizer(Rasterizer):
 
     @torch.no_grad()
     def depth_windows(
-        self,
-        gaussians: Gaussians,
-        seen: Sequence[tuple[View, Crop]],
-        *,
-        visible: float,
-        antialiased: bool = False,
+        self, gaussians: Gaussians, shots: Sequence[Shot], *, visible: float, antialiased: bool = False
     ) -> Iterator[ZWindow]:
-        for few in _a_few(seen, seen, gaussians):
-            views, crops = zip(*few, strict=True)
-            projected = project(self._kind, gaussians, views, 0, antialiased)
-            drawing = Drawing.of(self._kind, FlatSplats.of(projected), crops)
+        for few in _a_few(shots, gaussians):
+            projected = project(self._kind, gaussians, [shot.view for shot in few], 0, antialiased)
+            drawing = Drawing.of(self._kind, FlatSplats.of(projected), [shot.crop for shot in few])
             yield from drawing.windows(visible)
 
     def _draw_alike(
@@ -138,13 +132,9 @@ class GsplatRasterizer(Rasterizer):
         return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]
 
 
-def _a_few(
-    items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
-) -> Iterator[list[Item]]:
-    pairs = zip(items, seen, strict=True)
-    for _, alike in groupby(pairs, lambda pair: _size(pair[1][0])):
-        own, seen_by = zip(*alike, strict=True)
-        yield from runs(own, [crop for _, crop in seen_by], gaussians=len(gaussians), padded=True)
+def _a_few(shots: Sequence[AnyShot], gaussians: Gaussians) -> Iterator[list[AnyShot]]:
+    for _, alike in groupby(shots, lambda shot: _size(shot.view)):
+        yield from runs(list(alike), gaussians=len(gaussians), padded=True)
 
 
 def _size(view: View) -> tuple[int, int, float]:
