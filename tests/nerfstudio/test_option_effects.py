@@ -1,4 +1,4 @@
-"""Options have an effect; training's own: tests/engine/train/test_option_effects.py."""
+"""Every option that is offered has an effect; training's own: tests/engine/train/test_option_effects.py."""
 
 from operator import attrgetter
 from pathlib import Path
@@ -7,11 +7,16 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from abcd_ns import methods
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.options import HONOURED, MIRRORED, SAME
+from abcd_ns.nerfstudio.run.settings import flat_options
 from tests.data.dataparser_scenes import NAMES, write_capture, write_model, write_photos
+from tests.engine.train.test_option_effects import NOT_LEARNT, OTHERS, OTHERS_OF_DENSITY
 from tests.nerfstudio.crash_training import gaussians
+from tests.nerfstudio.test_options import refused
 from tests.nerfstudio.test_training import configure, run, set_option
 
 GROUPS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
@@ -26,6 +31,7 @@ LEARNT = {
     **{f"optimizers.{group}.optimizer.{name}": 0.1 for group in GROUPS for name in ("lr", "weight_decay")},
 }
 """What a checkpoint of a short run differs by."""
+DATA = "pipeline.datamanager.dataparser."
 READ = {
     "downscale_factor": 2,
     "max_side": 20,
@@ -41,6 +47,37 @@ READ = {
     "scale_factor": 2.0,
 }
 """What the reader's cameras, points, photos and masks differ by."""
+LOGGED = {
+    "output_dir", "experiment_name", "timestamp", "method_name", "relative_model_dir", "vis", "data",
+    "steps_per_save", "save_only_latest_checkpoint", "steps_per_eval_batch", "steps_per_eval_image",
+    "steps_per_eval_all_images", "log_gradients", "logging.relative_log_dir", "logging.steps_per_log",
+    "logging.local_writer.enable",
+}  # fmt: skip
+"""See `test_what_a_run_writes_follows_its_options`."""
+ELSEWHERE = {
+    "load_dir", "load_step", "load_checkpoint", "load_config",  # test_resume.py
+    "pipeline.device_budget_gb", "pipeline.gaussian_bytes",  # tests/run/test_fit.py
+    "pipeline.workers", "pipeline.cluster",  # tests/cluster
+    "pipeline.ram_budget_gb", "pipeline.datamanager.photo_cache_gb",  # of memory alone
+    "pipeline.max_seconds",  # test_training.py
+    "pipeline.model.num_random", "pipeline.model.random_scale",  # of `random_init`
+    "pipeline.model.init_splats",  # test_init_splats.py
+    "pipeline.model.render", "pipeline.model.rasterizer", "pipeline.model.color_corrected_metrics",
+    "machine.device_type",
+    "pipeline.datamanager.data", f"{DATA}data",  # as `data`
+    f"{DATA}as_stored", "pipeline.datamanager.data_format",  # which tyro does not offer
+}  # fmt: skip
+"""Tested with what they are about."""
+OF_NERFSTUDIO = {
+    "project_name", "start_paused", "logging.max_buffer_size", "logging.profiler",
+    "logging.local_writer.max_log_size", "logging.local_writer.stats_to_track",
+    "viewer.camera_frustum_scale", "viewer.default_composite_depth", "viewer.image_format",
+    "viewer.jpeg_quality", "viewer.make_share_url", "viewer.max_num_display_images",
+    "viewer.quit_on_train_completion", "viewer.websocket_host", "viewer.websocket_port",
+    "viewer.websocket_port_default",
+    *(f"optimizers.{group}.optimizer.eps" for group in GROUPS),  # torch's; 1e-15 is far below any gradient
+}  # fmt: skip
+"""Read by nerfstudio's loggers, loop and viewer, or by Adam."""
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +162,16 @@ def test_what_a_run_writes_follows_its_options(data, tmp_path, capsys):
     assert steps["Eval Images Metrics Dict (all images)/psnr"][:2] == [5, 10]
     assert scalars["Train Metrics Dict/Gradients/Total"][-1].value > 0
     assert "Train Iter (time)" in capsys.readouterr().out
+
+
+def test_every_option_that_is_offered_is_looked_at():
+    config = methods.abcd.config
+    same = [name.replace("-", "_") for flags in SAME.values() for name in flags.values()]
+    of_model = {f"pipeline.model.{name}" for name in (*same, *MIRRORED)}  # are `training`'s by other names
+    offered = {name for name in flat_options(config) if not refused(name)} - of_model
+    offered |= {f"pipeline.model.{name}" for name in {*HONOURED} - {*MIRRORED}}
+    training = {f"pipeline.training.{name}" for name in {*OTHERS, *NOT_LEARNT} - {"density"}}
+    training |= {f"pipeline.training.density.{name}" for name in OTHERS_OF_DENSITY}
+    looked_at = {*LEARNT, *(DATA + name for name in READ), *LOGGED, *ELSEWHERE, *OF_NERFSTUDIO, *training}
+    assert offered - looked_at == set()
+    assert looked_at - training - offered == set()

@@ -34,6 +34,8 @@ OTHERS_OF_DENSITY = {
     "refine_every": 12,
     "cull_alpha_thresh": 0.3,
 }
+NOT_LEARNT = {"recipe", "limits", "density", "commit_seconds"}
+"""What defines a method or follows from memory, the group tested beside, and when blocks are written."""
 
 
 @pytest.fixture(scope="module")
