@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.cluster.conftest import GROWING, in_process
+from tests.cluster.conftest import GROWING, in_process, target_of
 from tests.reference.scenes import STILL, equal, listen, stop, whole_scene
 
 
@@ -265,7 +266,7 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
         coarse_model=40,
         warmup=0.3,
         poses="SO3xR3",
-        target=lambda sample: (photos(sample.view.index, sample.crop), None),
+        target=partial(target_of, photos),
     )
     given = {index: view.viewmat for index, view in run.views.items()}
     while not run.trains_elsewhere:

@@ -259,5 +259,4 @@ class Results:
 
     @property
     def runs(self) -> tuple[Run, ...]:
-        """Of all arms."""
         return tuple(run for arm in self.arms for run in arm.runs)
