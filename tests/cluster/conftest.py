@@ -1,5 +1,6 @@
 """A small scene, and runs of it whose blocks are assigned to workers."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -38,9 +39,11 @@ class InProcessWorkers(Workers):
         busy = [member for member in self._members if member.assignment is not None]
         if not busy:
             return []
-        assignment = min(busy, key=lambda member: member.assignment.number).put_down()
+        return [self._finish(min(busy, key=lambda member: member.assignment.number).put_down())]
+
+    def _finish(self, assignment: Assignment) -> Finished:
         outcome = self._worker.visit(assignment.task, assignment.state(), assignment.drawn)
-        return [Finished(assignment.number, outcome)]
+        return Finished(assignment.number, outcome)
 
     def close(self) -> None: ...
 
@@ -59,9 +62,11 @@ def setup_of(run: TrainingRun) -> RunSetup:
     return RunSetup.of(run, LayerRoom())
 
 
-def in_process(run: TrainingRun, photos: Photos, count: int, **setup) -> InProcessWorkers:
+def in_process(
+    run: TrainingRun, photos: Photos, count: int, kind: Callable = InProcessWorkers, **setup
+) -> InProcessWorkers:
     worker = VisitWorker(replace(setup_of(run), **setup), TorchRasterizer(), partial(target_of, photos))
-    return InProcessWorkers(worker, count)
+    return kind(worker, count)
 
 
 def target_of(photos: Photos, sample: Sample) -> Target:
@@ -96,8 +101,8 @@ def make(tmp_path, views, photos):
 
 @pytest.fixture(scope="session")
 def steady(tmp_path_factory, views, photos):
-    """What two workers in this process make of a run that grows, and the setup of its workers."""
+    """What two workers in this process make of a run that grows, the setup of its workers, and its state."""
     folder = tmp_path_factory.mktemp("steady")
     run = make_run(folder, views, lambda run: in_process(run, photos, 2), lag=4, density=GROWING)
     train(run, photos)
-    return whole_scene(run), setup_of(run.run)
+    return whole_scene(run), setup_of(run.run), run.state

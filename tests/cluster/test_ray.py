@@ -95,10 +95,6 @@ def assigned_to(workers: RayWorkers, folder: Path, views) -> Dispatcher:
     return make_run(folder, views, lambda _: workers, lag=4, density=GROWING)
 
 
-def deaths(workers: RayWorkers) -> int:
-    return sum(worker.deaths for worker in workers.seen())
-
-
 def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, assigned, photos):
     seen = listen(assigned, WorkersSeen)
     assigned_first(assigned)
@@ -223,7 +219,7 @@ def test_a_machine_that_is_lost_takes_nothing_along(steady, tmp_path, views, pho
         assigned_first(assigned)
         machines.remove_node(other, allow_graceful=False)
         train(assigned, photos)
-        assert deaths(workers) > 0
+        assert sum(worker.deaths for worker in workers.seen()) > 0
         assert equal(whole_scene(assigned), steady[0])
     finally:
         ray.shutdown()
