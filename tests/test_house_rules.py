@@ -96,6 +96,7 @@ def text_files() -> list[Path]:
         pytest.param(without(MACHINE_PATHS), text_files(), id="machine_independent"),
         pytest.param(without(INDEX_HOSTS), config_files(), id="no_index_hosts"),
         pytest.param(without(RUNS_CODE), PACKAGE_FILES, id="unsafe"),
+        pytest.param(without(r"\b[MG]B\b"), PACKAGE_FILES, id="bytes_by_powers_of_1024"),
     ],
 )
 def test_the_house_is_clean(rule, paths):
