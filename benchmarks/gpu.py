@@ -15,7 +15,7 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 import tyro
@@ -39,6 +39,7 @@ from benchmarks.runs import read_stage
 
 OUT = Path("docs/results/gpu")
 Found = dict[str, Any]
+Part = Literal["build", "compare", "compare-steps", "extent", "visit"]
 
 
 @dataclass
@@ -50,10 +51,8 @@ class Args:
     out: Path | None = None
     """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu; of a dry run, a
     temporary folder."""
-    parts: tuple[Literal["build", "compare", "compare-steps", "extent", "visit"], ...] = (
-        *("build", "compare", "compare-steps", "extent", "visit"),
-    )
-    """Of these, in this order."""
+    parts: tuple[Part, ...] = get_args(Part)
+    """In this order."""
     again: bool = False
     """Run these parts whether or not their files are there, from nothing."""
     dry_run: bool = False
@@ -114,14 +113,9 @@ def compare(args: Args, work: Path, by_steps: bool) -> Iterator[Found]:
     """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
     size = args.size
     budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
-    shared = {
-        "data": str(args.data.resolve()),
-        "out": str(work),
-        "seeds": (args.seed,),
-        "evals": 6,
-        "pictures": 0,
-    }
-    plan = make_plan(Options(methods=size.methods, **shared, **budget))
+    scene, seeds = str(args.data.resolve()), (args.seed,)
+    options = Options(data=scene, out=str(work), methods=size.methods, seeds=seeds, evals=6, pictures=0)
+    plan = make_plan(replace(options, **budget))
     arms = [(job.method, ()) for job in plan.jobs]
     arms += [("abcd", (f"blocks={count}",)) for count in size.blocks]
     jobs = tuple(ScoredJob(method, args.seed, plan.settings, changes) for method, changes in arms)
@@ -147,13 +141,8 @@ def visits(args: Args, work: Path) -> Iterator[Found]:
     capture = read_stage(given.data, given.downscale)
     found: Found = {"scene": given.data.name, "seconds": given.seconds, "by_blocks": []}
     for blocks in size.visit_blocks:
-        rows: list[Found] = []
-
-        def look(coordinator, rows=rows) -> None:
-            rows += visit.profile(coordinator, capture, size.profiled_steps)
-
         with tempfile.TemporaryDirectory(dir=work) as folder:
-            views, spent = visit.run(capture, blocks, given, Path(folder), look)
+            views, spent, rows = visit.run(capture, blocks, given, Path(folder), size.profiled_steps)
         stages = {"views": views, "ms_per_view": spent, "profile": rows}
         found["by_blocks"].append({"blocks": blocks, **stages})
         yield found

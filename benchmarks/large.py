@@ -128,14 +128,12 @@ class Town:
 
     def gaussians(self) -> Gaussians:
         """Opaque ones with all their harmonics."""
-        found = cloud_from_points(
-            self.points(), 255 * self._uniform(self.blocks * self.args.gaussians, 3)
-        ).gaussians()
+        points = self.points()
+        found = cloud_from_points(points, 255 * self._uniform(len(points), 3)).gaussians()
         rest = 0.02 * torch.randn(found.features_rest.shape, generator=self._random)
         scales = found.scales + math.log(self.args.gaussians / BLOCK) / 2
-        return replace(
-            found, scales=scales, features_rest=rest, opacities=torch.full_like(found.opacities, 3.0)
-        )
+        opaque = torch.full_like(found.opacities, 3.0)
+        return replace(found, scales=scales, features_rest=rest, opacities=opaque)
 
     def views(self) -> list[View]:
         """Along the streets, most of them looking that way."""
@@ -162,10 +160,9 @@ class Town:
             stops = in_town & ((at[..., :2] % PITCH - PITCH / 2).abs() < HALF).all(dim=2)
             stops |= (at[..., 2] < 0) | (steps == steps[-1])[:, None]
             ends = at[stops.int().argmax(dim=0), torch.arange(len(rays))]
-            for block, count in zip(
-                *(each.tolist() for each in tree.assign(ends).unique(return_counts=True)), strict=True
-            ):
-                found.setdefault(block, {})[view.index] = count / len(rays)
+            for block, count in enumerate(tree.assign(ends).bincount().tolist()):
+                if count:
+                    found.setdefault(block, {})[view.index] = count / len(rays)
         return found
 
 
@@ -198,21 +195,12 @@ class Small(TorchRasterizer):
 
 def begin(town: Town, folder: Path, start: Start | None = None) -> Coordinator:
     """A run that begins, or resumes."""
-    views, device = town.views(), torch.device("cpu")
+    views, device, args = town.views(), torch.device("cpu"), town.args
     names = [Path(str(view.index)) for view in views]
-    args = town.args
     capture = Capture(views, names, lambda _: None, town.gaussians, town.blocks * args.gaussians)
     empty, budget = nothing_active(3), Budget(steps=10**7)
-    run = (
-        options(town.blocks, town.args),
-        capture,
-        device,
-        folder,
-        budget,
-        Small(args.modelled / args.width),
-        *empty,
-    )
-    return begin_run(*run, lambda _: None, None, start)
+    run = options(town.blocks, args), capture, device, folder, budget
+    return begin_run(*run, Small(args.modelled / args.width), *empty, lambda _: None, None, start)
 
 
 def make(blocks: int, args: Args, folder: Path) -> None:
@@ -321,18 +309,12 @@ def main(args: Args) -> None:
     print_machine(f"{args.gaussians} Gaussians a block, {args.width} px, {args.visits} visits\n")
     rows = [["of a visit", *(f"{blocks} blocks" for blocks in found), "ratio"]]
     for name in first:
-        rows.append(
-            [
-                name,
-                *(f"{each[name]:,.2f}" for each in found.values()),
-                f"{last[name] / max(first[name], 1e-9):.2f}",
-            ]
-        )
+        ratio = last[name] / max(first[name], 1e-9)
+        rows.append([name, *(f"{each[name]:,.2f}" for each in found.values()), f"{ratio:.2f}"])
     print(markdown(rows))
     if args.out is not None:
-        args.out.write_text(
-            json.dumps({"args": asdict(replace(args, out=None)), "visits": found}, indent=1) + "\n"
-        )
+        record = {"args": asdict(replace(args, out=None)), "visits": found}
+        args.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

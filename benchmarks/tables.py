@@ -16,7 +16,6 @@ from abcd_ns.lab.results.tables import MEASURES, NOTHING, cell, markdown
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "results" / "README.md"
 TABLE = re.compile(r"(?<=<!-- table: )(.+?) -->\n(?:\|.*\n)*(?=<!-- end -->)")
 NAMES = {"abcd-monolithic": "one block"}
-BYTES = "gaussian_bytes="
 PSNR = next(measure for measure in MEASURES if measure.field == "psnr_merged")
 
 
@@ -48,8 +47,8 @@ def _by_variant(results: Results) -> Iterator[tuple[str, dict[str, Arm]]]:
         arms = {arm.method: arm for arm in results.arms if arm.variant == variant}
         (arm, *_) = arms.values()
         words = results.labels[arm.name].removeprefix(arm.method).lstrip(", ")
-        if variant.startswith(BYTES):
-            words = f"1/{results.arms[0].mean('gaussian_bytes') / int(variant.removeprefix(BYTES)):.0f}"
+        if arm.is_budgeted:
+            words = f"1/{results.arms[0].mean('gaussian_bytes') / arm.value:.0f}"
         yield "" if variant == "default" else words, arms
 
 

@@ -7,7 +7,6 @@ when the device is done. That makes steps slower: their sum is no training time.
 """
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,17 +30,8 @@ from abcd_ns.run.begin import begin_run
 from abcd_ns.run.options import RunOptions
 from benchmarks.runs import StageClock, print_machine, read_stage
 
-STAGES = (
-    "plan and attach",
-    "layers",
-    "photos",
-    "render",
-    "loss",
-    "backward",
-    "optimizers",
-    "density and settling",
-    "commit",
-)
+STAGES = ("plan and attach", "layers", "photos", "render", "loss")
+STAGES += ("backward", "optimizers", "density and settling", "commit")
 
 
 @dataclass
@@ -70,17 +60,10 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
 
 
 def run(
-    capture: Stage,
-    blocks: int,
-    args: Args,
-    folder: Path,
-    afterwards: Callable[[Coordinator], None] = lambda _: None,
-) -> tuple[int, dict[str, float]]:
-    """Train; the views that the second half has drawn, and its milliseconds a view by stage.
-
-    Args:
-        afterwards: given the coordinator when the clock has stopped.
-    """
+    capture: Stage, blocks: int, args: Args, folder: Path, profiled_steps: int = 0
+) -> tuple[int, dict[str, float], list[dict[str, Any]]]:
+    """Train; the views that the second half has drawn, its milliseconds a view by stage, and the profile of
+    some more steps."""
     coordinator = begin(capture, blocks, args, folder)
     clock, views = StageClock(), 0
     scene = coordinator.scene
@@ -92,9 +75,9 @@ def run(
             views = 0
         views += step(coordinator, capture, clock)
     spent = {stage: 1e3 * clock.seconds[stage] / views for stage in STAGES}
-    afterwards(coordinator)
+    profiled = profile(coordinator, capture, profiled_steps) if profiled_steps else []
     coordinator.close()
-    return views, spent
+    return views, spent, profiled
 
 
 def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int:
@@ -155,9 +138,9 @@ def main(args: Args) -> None:
     print_machine(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
     table = [["stage", "1 block", f"{args.blocks} blocks"]]
     for stage in STAGES:
-        table.append([stage, *(f"{ms[stage]:.2f}" for _, ms in (one, several))])
-    table.append(["all", *(f"{sum(ms.values()):.2f}" for _, ms in (one, several))])
-    print(markdown([*table, ["views", *(str(views) for views, _ in (one, several))]]))
+        table.append([stage, *(f"{ms[stage]:.2f}" for _, ms, _ in (one, several))])
+    table.append(["all", *(f"{sum(ms.values()):.2f}" for _, ms, _ in (one, several))])
+    print(markdown([*table, ["views", *(str(views) for views, *_ in (one, several))]]))
 
 
 if __name__ == "__main__":

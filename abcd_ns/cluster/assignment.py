@@ -3,10 +3,9 @@
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,26 +52,15 @@ class VisitOutcome:
     health: BlockHealth
     layer_seconds: float
 
+    def __getstate__(self) -> dict[str, Any]:
+        tensors, meta = self.state.packed()
+        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}  # pickle does not copy these
+        return {**vars(self), "state": (arrays, meta)}
 
-@dataclass(frozen=True)
-class Parcel:
-    """An outcome on its way between processes: its tensors as arrays, which pickle does not copy."""
-
-    outcome: VisitOutcome  # without its Gaussians
-    arrays: dict[str, np.ndarray]
-    meta: dict[str, Any]
-
-    @staticmethod
-    def of(outcome: VisitOutcome) -> "Parcel":
-        """Pack it; no memory is copied."""
-        tensors, meta = outcome.state.packed()
-        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-        return Parcel(replace(outcome, state=outcome.state.nobody), arrays, meta)
-
-    def opened(self) -> VisitOutcome:
-        """What was packed, in memory of its own."""
-        tensors = {name: torch.tensor(array) for name, array in self.arrays.items()}
-        return replace(self.outcome, state=BlockState.unpacked(Packed(tensors, self.meta)))
+    def __setstate__(self, fields: dict[str, Any]) -> None:
+        arrays, meta = fields["state"]
+        tensors = {name: torch.tensor(array) for name, array in arrays.items()}  # in memory of their own
+        vars(self).update({**fields, "state": BlockState.unpacked(Packed(tensors, meta))})
 
 
 @dataclass(frozen=True)
@@ -127,11 +115,9 @@ class Member:
 
     @property
     def is_idle(self) -> bool:
-        """Whether it could take a visit now."""
         return self.ready and self.assignment is None
 
     def take(self, assignment: Assignment) -> None:
-        """Begin a visit."""
         self.waited += time.monotonic() - self.free_since
         self.assignment, self.done = assignment, 0
 
@@ -170,9 +156,9 @@ class Workers(ABC):
         """Processes of those that train."""
         return [member.pid for member in self._members if member.assignment]
 
-    @abstractmethod
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """What reads this wherever a worker is, as long as the caller keeps it."""
+        return lambda: value  # what is stored never changes
 
     @abstractmethod
     def submit(self, assignment: Assignment) -> None:

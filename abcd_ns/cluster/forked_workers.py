@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from multiprocessing.sharedctypes import RawValue
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import torch
 
@@ -25,17 +25,15 @@ from abcd_ns.cluster.assignment import (
     Finished,
     Lost,
     Member,
-    Parcel,
     Report,
     StepsSeen,
+    VisitOutcome,
     Workers,
     WorkersError,
 )
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
-from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.kernels.native import share_cores
-from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
 from abcd_ns.machine import end_with_parent
 
@@ -82,9 +80,6 @@ class ForkedWorkers(Workers):
         """Seconds in all; processes that were forked read it, too."""
         self._held_since: float | None = None
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
-
-    def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
-        return lambda: value  # a fork has it, too, and what is stored never changes
 
     def submit(self, assignment: Assignment) -> None:
         member = self._longest_idle()
@@ -149,9 +144,9 @@ class ForkedWorkers(Workers):
             case (int(done), float(psnr)):
                 member.done = done
                 return [StepsSeen(member.assignment.number, done, psnr)]
-            case Parcel():
+            case VisitOutcome():
                 member.visits += 1
-                return [Finished(self._end(member).number, said.opened())]
+                return [Finished(self._end(member).number, said)]
             case MemoryError():
                 return [self._lose(member, str(said))]
         self._end(member)
@@ -173,7 +168,7 @@ class ForkedWorkers(Workers):
         return assignment
 
 
-def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> NoReturn:
+def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], VisitOutcome]) -> NoReturn:
     """All that a worker's process does. Any error ends it, after it was reported."""
     status, told = 1, time.monotonic()
 
@@ -191,7 +186,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> 
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         pipe.send(None)
         share_cores(1)
-        pipe.send(Parcel.of(visit(tell)))
+        pipe.send(visit(tell))
         status = 0
     except Exception as error:
         with suppress(OSError):

@@ -23,9 +23,9 @@ from abcd_ns.cluster.assignment import (
     Finished,
     Lost,
     Member,
-    Parcel,
     Report,
     StepsSeen,
+    VisitOutcome,
     VisitTask,
     Workers,
     WorkersError,
@@ -74,7 +74,7 @@ class Actor:
 
     def __init__(self) -> None:
         self._worker: VisitWorker | None = None
-        self._done, self._psnr = 0, math.nan
+        self._seen = 0, math.nan
 
     def prepare(self, version: str, make: bytes) -> int:
         """Read what the run needs; gives the process' identifier. `version` is of abcd_ns where the run was
@@ -86,18 +86,18 @@ class Actor:
         self._worker = cloudpickle.loads(make)()
         return os.getpid()
 
-    def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> Parcel:
-        """Train a block; gives what became of it."""
-        self._done, self._psnr = 0, math.nan
-        return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
+    def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> VisitOutcome:
+        """Train a block."""
+        self._seen = 0, math.nan
+        return self._worker.visit(task, state(), drawn, self._hear)
 
     def _hear(self, event: Event) -> None:
         if isinstance(event, StepTaken):
-            self._done, self._psnr = event.visit_step, event.psnr
+            self._seen = event.visit_step, event.psnr
 
     def progress(self) -> tuple[int, float]:
         """Steps of the visit so far, and the PSNR of the last one, dB."""
-        return self._done, self._psnr
+        return self._seen
 
 
 @dataclass
@@ -198,7 +198,7 @@ class RayWorkers(Workers):
             member.since = member.since or member.free_since
             return []
         member.visits += 1
-        return [Finished(assignment.number, answer.opened())]
+        return [Finished(assignment.number, answer)]
 
     def _replace(self, member: Remote, why: str) -> list[Report]:
         """End one, if it is not gone, and start another in its place."""

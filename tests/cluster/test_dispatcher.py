@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -15,118 +16,96 @@ from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.cluster.conftest import GROWING, in_process
+from tests.cluster.conftest import GROWING, InProcessWorkers, in_process, target_of
 from tests.reference.scenes import STILL, equal, listen, stop, whole_scene
 
 
-class Unreliable:
-    """Workers in this process who answer in any order, late, twice, or never.
+class Unreliable(InProcessWorkers):
+    """They answer in any order, late, twice, or never.
 
     Args:
-        fate: says what becomes of an assignment: "lost", "late" (lost, and answered all the same), or "done".
+        fate: picks one of the members at work, and says what becomes of its visit: "lost", "late" (lost, and
+            answered all the same), or "done".
     """
 
-    def __init__(self, inner, fate) -> None:
-        self._inner, self._fate = inner, fate
-        self._out, self._late = [], []
+    def __init__(self, worker: VisitWorker, count: int, fate) -> None:
+        super().__init__(worker, count)
+        self._fate, self._late = fate, []
         self.lost = self.answered_late = 0
 
-    def __getattr__(self, name):
-        return getattr(self._inner, name)
-
-    @property
-    def idle(self):
-        return self.count - len(self._out)
-
-    def submit(self, assignment):
-        assert self.idle > 0
-        self._out.append(assignment)
-
-    def wait(self, seconds):
+    def wait(self, seconds):  # noqa: ARG002 - nothing is under way meanwhile
         late, self._late = self._late, []
-        if not self._out:
+        busy = [member for member in self._members if member.assignment is not None]
+        if not busy:
             return late
-        assignment, fate = self._fate(self._out)
-        self._out.remove(assignment)
-        reports = [StepsSeen(assignment.number, 1, 20.0)]
-        if fate != "lost":
-            self._inner.submit(assignment)
-            (answer,) = self._inner.wait(seconds)
-            reports = [*reports, answer]
+        member, fate = self._fate(busy)
+        assignment = member.put_down()
         if fate == "done":
-            return late + reports
+            return [*late, StepsSeen(assignment.number, 1, 20.0), self._finish(assignment)]
         self.lost += 1
         if fate == "late":  # and with another answer
-            outcome = reports[-1].outcome
-            self._late = [Finished(assignment.number, replace(outcome, state=outcome.state.nobody))]
+            number, outcome = self._finish(assignment)
+            self._late = [Finished(number, replace(outcome, state=outcome.state.nobody))]
             self.answered_late += 1
         return [*late, Lost(assignment.number, fate)]
 
 
+HARMONICS = {"late_harmonics": 2, "block_limit": 30}
+"""They come late, while blocks in their first visits still grow; workers keep to the room that they leave."""
+
+
 @pytest.mark.parametrize(
-    "options", [{"density": GROWING}, {"density": STILL, "coarse_model": 40, "warmup": 0.3}]
+    "options",
+    [
+        {"density": GROWING},
+        {"density": STILL, "coarse_model": 40, "warmup": 0.3},
+        {"density": replace(GROWING, refine_stop=0.2, min_contribution=0.0), **HARMONICS},
+    ],
 )
-def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos, options):
+def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos, options, monkeypatch):
+    monkeypatch.setattr(control, "MOST_NEW", 1.0)
     alone, assigned = make("alone", **options), make("assigned", workers=1, lag=1, **options)
     train(alone, photos)
     train(assigned, photos)
     assert isinstance(assigned, Dispatcher)
     assert alone.state.step == assigned.state.step == 60
+    assert alone.state.sh_degree == 1
     assert equal(whole_scene(alone), whole_scene(assigned))
     assert alone.state.to_json() | {"seconds": 0} == assigned.state.to_json() | {"seconds": 0}
 
 
-def test_workers_keep_to_the_room_that_harmonics_leave(make, photos, monkeypatch):
-    """Which came while blocks in their first visits still grow."""
-    monkeypatch.setattr(control, "MOST_NEW", 1.0)
-    density = replace(GROWING, refine_stop=0.2, min_contribution=0.0)
-    options = {"density": density, "late_harmonics": 2, "block_limit": 30}
-    alone, assigned = make("alone", **options), make("assigned", workers=1, lag=1, **options)
-    for run in (alone, assigned):
-        train(run, photos)
-        assert run.state.sh_degree == 1
-    assert equal(whole_scene(alone), whole_scene(assigned))
+def unreliable(photos, fate) -> partial:
+    return partial(in_process, photos=photos, count=2, kind=partial(Unreliable, fate=fate))
 
 
-def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos):
-    lag = 4
-    steady = make("steady", workers=2, lag=lag, density=GROWING)
-    train(steady, photos)
-    rng, workers = random.Random(1), []
+def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos, steady):
+    rng = random.Random(3)
 
-    def fate(assignments):
-        return rng.choice(assignments), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
+    def fate(members):
+        return rng.choice(members), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
 
-    def unreliable(run):
-        workers.append(Unreliable(in_process(run, photos, 2), fate))
-        return workers[-1]
-
-    shaken = make("shaken", workers=unreliable, lag=lag, density=GROWING)
+    shaken = make("shaken", workers=unreliable(photos, fate), lag=4, density=GROWING)
     lost = listen(shaken, WorkerLost)
     train(shaken, photos)
-    assert len(lost) == workers[0].lost > 0
-    assert workers[0].answered_late > 0
-    assert equal(whole_scene(steady), whole_scene(shaken))
-    assert steady.state.to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
+    assert len(lost) == shaken.workers.lost > 0
+    assert shaken.workers.answered_late > 0
+    assert equal(steady[0], whole_scene(shaken))
+    assert steady[2].to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
 
 
 def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):
     run = make(workers=3, density=STILL)
+    events, epochs = listen(run, VisitBegan | VisitEnded), listen(run, EpochEnded)
+    train(run, photos)
     out, most, ended = set(), 0, []
-
-    def hear(event) -> None:
-        nonlocal most
+    for event in events:
         if isinstance(event, VisitBegan):
             assert event.block not in out
             out.add(event.block)
             most = max(most, len(out))
-        elif isinstance(event, VisitEnded):
+        else:
             out.remove(event.block)
             ended.append(event.visit)
-
-    run.announce.subscribe(hear)
-    epochs = listen(run, EpochEnded)
-    train(run, photos)
     assert most > 1
     assert ended == sorted(ended)
     assert not out
@@ -138,14 +117,9 @@ def test_who_has_a_long_visit_keeps_no_other_from_beginning_the_next(make, photo
     run = make(workers=2, density=STILL, lag=2, steps=8)
     run.state.views = dict.fromkeys(range(4), 8)
     run.state.queue = [VisitPlan(block, steps) for block, steps in enumerate((4, 1, 1, 2))]
-    heard = []
-
-    def hear(event) -> None:
-        if isinstance(event, VisitBegan | VisitEnded):
-            heard.append((type(event) is VisitBegan, event.visit))
-
-    run.announce.subscribe(hear)
+    events = listen(run, VisitBegan | VisitEnded)
     train(run, photos)
+    heard = [(type(event) is VisitBegan, event.visit) for event in events]
     assert [visit for begins, visit in heard if not begins] == [1, 2, 0, 3]
     assert heard.index((True, 3)) < heard.index((False, 0))
 
@@ -206,8 +180,7 @@ def test_visits_that_are_under_way_are_kept_when_a_run_stops(make, photos):
     assert (stopped.state.in_flight, stopped.state.planned) == ([], planned)
     assert stopped.state.step == planned > before
     assert not stopped.await_visits()
-    stopped.save()
-    stopped.close()
+    stop(stopped)
     resumed = make(workers=2, resume=True, density=STILL)
     assert resumed.state.step == stopped.state.step
     train(resumed, photos)
@@ -215,9 +188,7 @@ def test_visits_that_are_under_way_are_kept_when_a_run_stops(make, photos):
 
 
 def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):
-    run = make(
-        workers=lambda r: Unreliable(in_process(r, photos, 2), lambda assignments: (assignments[0], "lost"))
-    )
+    run = make(workers=unreliable(photos, lambda members: (members[0], "lost")))
     with pytest.raises(WorkersError, match=rf"lost {LOSSES} workers.*abcd plan"):
         train(run, photos)
     assert run.state.step == 0
@@ -265,7 +236,7 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
         coarse_model=40,
         warmup=0.3,
         poses="SO3xR3",
-        target=lambda sample: (photos(sample.view.index, sample.crop), None),
+        target=partial(target_of, photos),
     )
     given = {index: view.viewmat for index, view in run.views.items()}
     while not run.trains_elsewhere:

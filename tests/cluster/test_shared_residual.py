@@ -1,6 +1,7 @@
 """Blocks that are out at once make good, all together, what is missing, and no more."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -8,12 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.cluster.shared_residual import FAINT, SharedResidual, shares, shown_beside
-from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import train
-from tests.cluster.conftest import setup_of
-from tests.cluster.in_process import InProcessWorkers
+from tests.cluster.conftest import in_process
 from tests.reference.scenes import STILL, equal, whole_scene
 
 INFLUENCE = st.dictionaries(
@@ -76,15 +75,10 @@ def test_all_blocks_begin_with_the_picture_of_the_whole_scene_and_share_it(make,
 
 
 def test_with_no_room_pictures_are_drawn_when_they_are_asked_for(make, photos):
-    def trained(name, room):
-        def workers(run):
-            setup = replace(setup_of(run), layer_room=room)
-            target = lambda s: (photos(s.view.index, s.crop), None)  # noqa: E731
-            return InProcessWorkers(VisitWorker(setup, TorchRasterizer(), target), 3)
-
+    scenes = []
+    for name, room in (("kept", LayerRoom()), ("drawn", LayerRoom(0))):
+        workers = partial(in_process, photos=photos, count=3, layer_room=room)
         run = make(name, workers=workers, lag=3, density=STILL, steps=30)
         train(run, photos)
-        return whole_scene(run)
-
-    kept, drawn = trained("kept", LayerRoom()), trained("drawn", LayerRoom(0))
-    assert equal(kept, drawn)
+        scenes.append(whole_scene(run))
+    assert equal(*scenes)

@@ -1,4 +1,4 @@
-"""The charts of a comparison: PSNR over training time, PSNR over Gaussians, memory over Gaussians."""
+"""The charts of a comparison: PSNR over time, Gaussians and peak memory, and memory over Gaussians."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +15,8 @@ from abcd_ns.units import MIB
 
 Along = Callable[[CurvePoint], float]  # what lies along the axis of x
 PALEST = 0.55  # share of white in the colour of a method's last arm
+QUALITY = {"psnr_merged": "held-out PSNR (dB)", "ssim_merged": "held-out SSIM"}
+"""By field of a run, what the chart of budgets shows of it."""
 
 
 @in_style
@@ -102,3 +104,43 @@ def _draw_memory(results: Results) -> Figure:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.legend(loc="outside right center")
     return figure
+
+
+@in_style
+def draw_budgets(results: Results, out: Path) -> list[Path]:
+    """Write PSNR and SSIM over peak memory as png into `out`; nothing where no arm has a budget."""
+    arms = [arm for arm in results.arms if all(run.gaussian_bytes for run in arm.runs)]
+    if not any(arm.is_budgeted for arm in arms):
+        return []
+    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+    for axes, (field, title) in zip(figure.subplots(1, 2), QUALITY.items(), strict=True):
+        lay_grid(axes)
+        for method in results.methods:
+            own = sorted((arm for arm in arms if arm.method == method), key=_mebibytes)
+            _draw_method(axes, method, own, field)
+        axes.set(xscale="log", xlabel="peak memory of Gaussians (MiB)", ylabel=title)
+        for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            which(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "125" else "")
+    figure.suptitle(results.title, x=0.02, ha="left")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return [save(figure, out, "memory_accuracy")]
+
+
+def _draw_method(axes: Axes, method: str, arms: Sequence[Arm], field: str) -> None:
+    """A line through its budgets, bars from the lowest seed to the highest; dotted what no limit gives."""
+    look = {"color": COLORS[method], "marker": MARKERS[method]}
+    if within := [arm for arm in arms if arm.is_budgeted]:
+        means = [arm.mean(field) for arm in within]
+        ends = [[getattr(run, field) for run in arm.runs] for arm in within]
+        bars = [[mean - min(e), max(e) - mean] for mean, e in zip(means, ends, strict=True)]
+        x = list(map(_mebibytes, within))
+        axes.errorbar(x, means, list(zip(*bars, strict=True)), label=f"{method} within a budget", **look)
+    for arm in arms:
+        if not arm.is_budgeted:
+            axes.axhline(arm.mean(field), color=look["color"], linewidth=0.8, linestyle=":")
+            label = f"{method} without a limit"
+            axes.plot([_mebibytes(arm)], [arm.mean(field)], linestyle="", label=label, **look)
+
+
+def _mebibytes(arm: Arm) -> float:
+    return arm.mean("gaussian_bytes") / MIB

@@ -6,6 +6,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,16 +16,7 @@ from rich.console import Console
 from abcd_ns.arguments import Flag, check_numbers, check_ranges, words
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.budgets import (
-    ALONE,
-    JOINT,
-    WITHIN,
-    draw_budgets,
-    is_budgeted,
-    shares_of,
-    within_budgets,
-)
-from abcd_ns.lab.compare.charts import draw_charts
+from abcd_ns.lab.compare.charts import draw_budgets, draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import (
     METHODS,
@@ -38,13 +30,17 @@ from abcd_ns.lab.job import (
     scene_name,
 )
 from abcd_ns.lab.results.records import decode, read_toml
-from abcd_ns.lab.results.results import TERRAIN, Results, Run
+from abcd_ns.lab.results.results import BUDGET, TERRAIN, Results, Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.runner import run_jobs, write_report
 from abcd_ns.terminal import print_plain
 from abcd_ns.units import bytes_in_words
 
 PICTURES = "pictures"
+JOINT = "abcd-monolithic"
+"""Of what this takes, budgets are shares; within one it has as many Gaussians as fit."""
+WITHIN = ("abcd", JOINT, "abcd-ablated", "abcd-partition")  # methods that keep to a budget
+ALONE = ("splatfacto", "splatfacto-scaled")  # ceilings, which keep to none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +207,32 @@ def _budgets_plan(given: Options, asked: Options) -> Plan:
     return Plan("comparison", settings, Path(given.out), jobs, command)
 
 
+def shares_of(texts: Sequence[str]) -> list[Fraction]:
+    """The budgets, the largest first; a UserError where one is no share."""
+    try:
+        found = {Fraction(text) for text in texts}
+    except (ValueError, ZeroDivisionError):
+        found = set()
+    if not found or min(found) <= 0 or max(found) > 1:
+        raise UserError(f"--budgets {' '.join(texts)}: give shares above 0 and up to 1, such as 1/4.")
+    return sorted(found, reverse=True)
+
+
+def within_budgets(plan: Plan, ceilings: Results, methods: Sequence[str], shares: Sequence[Fraction]) -> Plan:
+    """The plan, and methods within shares of the memory of joint training; a UserError where that failed."""
+    took = [run.gaussian_bytes for run in ceilings.runs if run.method == JOINT]
+    if not took:
+        raise UserError(f"{JOINT} failed, of whose memory the budgets are shares; see its log.")
+    jobs = tuple(
+        Job(method, seed, plan.settings, (f"{BUDGET}={int(share * max(took))}",))
+        for seed in ceilings.seeds
+        for share in shares
+        for method in METHODS
+        if method in WITHIN and method in (*methods, JOINT)
+    )
+    return dataclasses.replace(plan, jobs=(*plan.jobs, *jobs))
+
+
 def _terrain_plan(given: Options) -> Plan:
     """Runs on terrains of so many tiles."""
     if others := given.given.keys() - TERRAIN_OPTIONS:
@@ -282,7 +304,8 @@ def shown(results: Results, plan: Plan) -> list[tuple[str, Run, Path]]:
     arms = []
     for method in results.methods:
         own = results.of(method)
-        arms += [arm for arm in own if not is_budgeted(arm)][:1] + [*filter(is_budgeted, own)][-1:]
+        budgeted = [arm for arm in own if arm.is_budgeted]
+        arms += [arm for arm in own if not arm.is_budgeted][:1] + budgeted[-1:]
     seeds = [{run.seed for run in arm.runs} for arm in arms]
     shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]
     folders = {(job.method, job.variant, job.seed): job.folder(plan.out) for job in plan.jobs}

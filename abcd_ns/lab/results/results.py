@@ -11,6 +11,7 @@ from abcd_ns.units import bytes_in_words
 
 SCHEMA = 2  # raised whenever a field changes its name or meaning
 RESULTS_FILE = "results.json"
+BUDGET = "gaussian_bytes"  # the option that sets a memory budget
 TERRAIN = "comparison of sizes"  # the kind of results of `abcd compare --tiles`, where nothing is held out
 
 
@@ -152,6 +153,11 @@ class Arm:
         """The method, and what of it is set."""
         return self.method if self.variant == "default" else f"{self.method} {self.variant}"
 
+    @property
+    def is_budgeted(self) -> bool:
+        """Whether its runs keep to a memory budget."""
+        return self.variant.startswith(BUDGET)
+
     def mean(self, field: str) -> float:
         """Over the seeds, of a field of `Run` that all of them know."""
         return fmean(getattr(run, field) for run in self.runs)
@@ -259,5 +265,4 @@ class Results:
 
     @property
     def runs(self) -> tuple[Run, ...]:
-        """Of all arms."""
         return tuple(run for arm in self.arms for run in arm.runs)

@@ -165,14 +165,12 @@ class Training:
 
     @property
     def progress(self) -> float:
-        """The share of the run that is done."""
         if self.coordinator is None:
             return self._budget.progress(self.steps, self.stopwatch.seconds)
         return self.coordinator.progress
 
     @property
     def steps(self) -> int:
-        """Optimisation steps taken."""
         return self._steps if self.coordinator is None else self.coordinator.state.step
 
     @property
@@ -182,7 +180,6 @@ class Training:
 
     @property
     def gaussians(self) -> int:
-        """In the whole scene."""
         return self.pipeline.model.num_points if self.coordinator is None else self.coordinator.count()
 
     @property

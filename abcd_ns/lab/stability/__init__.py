@@ -1,4 +1,1 @@
-"""`abcd stability`: where methods fail, small scenes that make them, and what ABCD does there.
-
-`lab` trains; `scenarios` has the ways to fail.
-"""
+"""`abcd stability`: where methods fail, small scenes that make them, and what ABCD does there."""

@@ -115,7 +115,7 @@ RISES_BY = 1e-3  # a visit raised the objective if by more than this share of it
 )
 def old_layers(lab: Lab) -> Finding:
     """A13: the objective after each visit."""
-    stage = make_stage(views=ring(12), points=400)
+    stage = make_stage(views=ring(12))
     usual = {"budget": BUDGET // 2, "warmup": 0.0, "recipe": Recipe(limit_scales=False, passes=2)}
     usual["density"] = DensityConfig(strategy="off")
     coordinator = lab.coordinator(stage, **usual)
@@ -243,7 +243,7 @@ FOG = 0.02  # of the screen, in the mean over training views, at most
 )
 def fog(lab: Lab) -> Finding:
     """A23: the share of the screen that fog takes, every 50 steps."""
-    stage, said, most = make_stage(views=ring(12), points=400), {}, {}
+    stage, said, most = make_stage(views=ring(12)), {}, {}
     dark = {index: photo * vignette(*photo.shape[:2]) for index, photo in stage.photos.items()}
     for method in PAIR:
         coordinator = lab.coordinator(stage, method)

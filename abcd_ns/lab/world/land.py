@@ -34,13 +34,8 @@ class Land(World):
     """In each tile."""
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        if self.tiles < 1 or self.tiles & (self.tiles - 1):
-            raise ValueError(f"{self.tiles} tiles do not part in equal halves: give a power of 2")
-
     @property
     def columns(self) -> int:
-        """Tiles in a row."""
         return 1 << math.ceil(math.log2(self.tiles) / 2)
 
     def corner(self, tile: int) -> tuple[int, int]:
@@ -49,7 +44,6 @@ class Land(World):
 
     @property
     def middles(self) -> Float[Tensor, "tiles 3"]:
-        """Of the tiles."""
         corners = torch.tensor([self.corner(tile) for tile in range(self.tiles)], dtype=torch.float64)
         return torch.cat([corners + 0.5, torch.zeros(self.tiles, 1, dtype=torch.float64)], dim=1)
 
@@ -93,7 +87,7 @@ class Land(World):
         """What `view` sees in a part of its picture."""
         return self.first(view, crop).colors.view(crop.height, crop.width, 3)
 
-    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:  # noqa: ARG002 - waves are broad
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"]) -> Seen:
         """As World.look; black beyond the land's border."""
         t = -origin[2] / directions[:, 2]
         places = origin + t[:, None] * directions

@@ -52,7 +52,6 @@ class Wall:
     fineness: float = 1.0
 
     def meet(self, origin: Tensor, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """As Ball.meet."""
         t = (self.at - origin[self.axis]) / directions[:, self.axis]
         place = origin + t[:, None] * directions
         others = [k for k in range(3) if k != self.axis]
@@ -74,23 +73,23 @@ class World(ABC):
     """What looks the same from everywhere."""
 
     @abstractmethod
-    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:
-        """Along rays, each of which stands for `pixel_angle` radians: textures may be no finer."""
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"]) -> Seen:
+        """Along rays."""
 
     def first(self, view: View, crop: Crop | None = None) -> Seen:
         """Along each pixel's ray, row by row."""
         exact = view.to(torch.float64)
         directions = ray_directions(exact, TileGrid(crop or exact.full, 1)).T
-        return self.look(view.center.double(), directions, 1 / float(view.K[0, 0]))
+        return self.look(view.center.double(), directions)
 
-    def photo(self, view: View, fine: int = 2) -> Float[Tensor, "h w 3"]:
-        """The picture: the mean of `fine` x `fine` rays in each pixel."""
-        larger = view.resized(float(fine), fine * view.width, fine * view.height)
-        rows, bands = max(1, RAYS_AT_ONCE // (fine * larger.width)), []
+    def photo(self, view: View) -> Float[Tensor, "h w 3"]:
+        """The picture: the mean of four rays in each pixel."""
+        larger = view.resized(2.0, 2 * view.width, 2 * view.height)
+        rows, bands = max(1, RAYS_AT_ONCE // (2 * larger.width)), []
         for top in range(0, view.height, rows):
-            height = fine * min(rows, view.height - top)
-            band = self.first(larger, Crop(0, fine * top, larger.width, height)).colors
-            bands.append(F.avg_pool2d(band.reshape(height, larger.width, 3).permute(2, 0, 1), fine))
+            height = 2 * min(rows, view.height - top)
+            band = self.first(larger, Crop(0, 2 * top, larger.width, height)).colors
+            bands.append(F.avg_pool2d(band.reshape(height, larger.width, 3).permute(2, 0, 1), 2))
         return torch.cat(bands, dim=1).permute(1, 2, 0).float().contiguous()
 
     def points(self, views: list[View], count: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
@@ -115,8 +114,7 @@ class Surfaces(World):
     plain: float = 0.0
     """Share of the waves that is the same for all colours: with 1 a surface has shades of one colour."""
 
-    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:  # noqa: ARG002 - waves are broad
-        """As World.look."""
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"]) -> Seen:
         t = torch.stack([surface.meet(origin, directions) for surface in self.surfaces])
         nearest, which = t.min(dim=0)
         hit = nearest < FAR / 2

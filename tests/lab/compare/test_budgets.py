@@ -7,8 +7,8 @@ from rich.console import Console
 
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.budgets import draw_budgets, shares_of, within_budgets
-from abcd_ns.lab.compare.command import Options, make_plan
+from abcd_ns.lab.compare.charts import draw_budgets
+from abcd_ns.lab.compare.command import Options, make_plan, shares_of, within_budgets
 from abcd_ns.lab.job import Job
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.runner import run_jobs

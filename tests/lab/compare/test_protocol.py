@@ -86,22 +86,18 @@ def test_every_method_with_every_seed_block_count_and_change_has_a_folder_of_its
     assert "--blocks 4 1" in plan.command
 
 
-def test_changes_are_arms_beside_the_method_as_it_is(tmp_path):
-    vary = "training.density.min_contribution=0.5", "partition=grid blocks=27"
-    plan = make_plan(options(tmp_path, blocks=(4,), vary=vary))
-    assert names_of(plan) == [("abcd", name) for name in ("default", *vary)]
+def test_changes_are_arms_beside_the_method_as_it_is_and_one_block_is_one_block(tmp_path):
+    vary = "training.density.min_contribution=0.5", "blocks=9", "partition=grid blocks=27"
+    methods = ("abcd-monolithic", "abcd")
+    plan = make_plan(options(tmp_path, methods=methods, blocks=(4,), vary=vary))
     configs = [trainer_config(job, tmp_path).pipeline for job in plan.jobs]
+    blocks = [("default", 4), (vary[0], 4), (vary[1], 9), (vary[2], 27)]
+    expected = [("abcd-monolithic", name, 1) for name in ("default", vary[0], "partition=grid")]
+    expected += [("abcd", name, count) for name, count in blocks]
+    found = zip(names_of(plan), configs, strict=True)
+    assert [(*names, config.blocks) for names, config in found] == expected
     assert configs[1].training.density.min_contribution == 0.5
-    assert [c.blocks for c in configs] == [4, 4, 27]
-    assert "--vary training.density.min_contribution=0.5 'partition=grid blocks=27'" in plan.command
-
-
-def test_one_block_is_one_block_whatever_the_arm(tmp_path):
-    methods, vary = ("abcd-monolithic", "abcd"), ("blocks=27", "partition=grid blocks=9")
-    plan = make_plan(options(tmp_path, methods=methods, vary=vary))
-    found = [(j.method, j.variant, trainer_config(j, tmp_path).pipeline.blocks) for j in plan.jobs]
-    alone = [("abcd-monolithic", name, 1) for name in ("default", "partition=grid")]
-    assert found == [*alone, ("abcd", "default", 8), ("abcd", vary[0], 27), ("abcd", vary[1], 9)]
+    assert f"--vary {vary[0]} {vary[1]} '{vary[2]}'" in plan.command
 
 
 def test_a_change_of_many_options_has_a_folder_of_its_own_that_disks_take(tmp_path):

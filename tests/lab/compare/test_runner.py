@@ -42,25 +42,16 @@ def with_settings(plan: Plan, **changed) -> Plan:
     return dataclasses.replace(plan, settings=settings, jobs=jobs)
 
 
-def test_finished_runs_are_reused_and_spoilt_ones_are_not(plan, worker):
+def test_finished_runs_are_reused_and_others_are_not(plan, worker):
     first = run(plan)
     assert [outcome.method for outcome in first] == worker.calls() == ["abcd-monolithic", "abcd"]
     assert run(plan) == first
     assert worker.calls() == []
-    (plan.jobs[0].folder(plan.out) / "run.json").write_text('{"psnr": NaN}')
+    spoilt, half = (job.folder(plan.out) for job in plan.jobs)
+    (spoilt / "run.json").write_text('{"psnr": NaN}')
+    (half / "run.json").rename(half / "leftover")  # as if its worker had been killed
     assert run(plan) == first
-    assert worker.calls() == ["abcd-monolithic"]
-
-
-def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
-    run(dataclasses.replace(plan, jobs=plan.jobs[:1]))
-    half = plan.jobs[1].folder(plan.out)  # what a killed worker leaves
-    half.mkdir(parents=True)
-    (half / "job.json").write_text(json.dumps(dataclasses.asdict(plan.jobs[1])))
-    (half / "leftover").write_text("")
-    worker.calls()
-    assert [outcome.method for outcome in run(plan)] == ["abcd-monolithic", "abcd"]
-    assert worker.calls() == ["abcd"]
+    assert worker.calls() == ["abcd-monolithic", "abcd"]
     assert not (half / "leftover").exists()
 
 
