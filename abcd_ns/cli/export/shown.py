@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from abcd_ns.engine.gaussians.block_state import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.special_blocks import PENDING, BlockName
