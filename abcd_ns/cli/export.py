@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.cli.paths import check_file, find_run
+from abcd_ns.engine.gaussians.block_state import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.gaussians.packed import DRAWN, IS_DEFERRED, Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing

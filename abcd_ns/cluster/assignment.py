@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.events import WorkerSeen
-from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.gaussians.block_state import BlockState, Packed
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.train.run_state import ActiveVisit, BlockHealth
 from abcd_ns.engine.types import Gaussians

@@ -32,8 +32,7 @@ from abcd_ns.cluster.assignment import (
 )
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
-from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.gaussians.block_state import BlockState, Packed
 from abcd_ns.engine.kernels.native import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, first_line, is_out_of_memory

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,32 +25,6 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.to(device, non_blocking=True)
 
 
-class Download:
-    """A tensor of a device on its way to the host, which has it without waiting once the device came by.
-
-    Args:
-        tensor: of a device that has no events, or of the CPU, it is there at once.
-    """
-
-    def __init__(self, tensor: Tensor) -> None:
-        kind = event_of(tensor.device)
-        self._there = tensor.to("cpu", non_blocking=kind is not None)
-        self._event = kind and kind()
-        if self._event is not None:
-            # Of this device, which need not be the current one; Apple's has one stream, which has no name.
-            stream = getattr(torch.get_device_module(tensor.device), "current_stream", None)
-            if stream is None:
-                self._event.record()
-            else:
-                self._event.record(stream(tensor.device))
-
-    def read(self) -> Tensor:
-        """It; waits until it is there."""
-        if self._event is not None:
-            self._event.synchronize()
-        return self._there
-
-
 def event_of(device: torch.device) -> type | None:
     """What tells that a device has come to a point; None for one that has no such thing."""
     module = None if device.type == "cpu" else torch.get_device_module(device)
@@ -67,24 +42,38 @@ class StepNumbers:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._sent: deque[tuple[dict[str, int], Download]] = deque()
+        self._device, self._kind = device, event_of(device)
+        self._sent: deque[tuple[dict[str, int], Tensor, Any]] = deque()
 
     @property
     def are_late(self) -> bool:
         """Whether they are better not asked for in the step that they are of."""
-        return event_of(self._device) is not None
+        return self._kind is not None
 
     def send(self, parts: Parts) -> None:
         """Have them copied."""
         flat = [number for part in parts.values() for number in part]
         if flat:
             counts = {name: len(part) for name, part in parts.items()}
-            self._sent.append((counts, Download(torch.stack(flat))))
+            there = torch.stack(flat).to("cpu", non_blocking=self.are_late)
+            self._sent.append((counts, there, self._recorded() if self.are_late else None))
+
+    def _recorded(self) -> Any:
+        """What tells that the device has come to here."""
+        event = self._kind()
+        # Of this device, which need not be the current one; Apple's has one stream, which has no name.
+        stream = getattr(torch.get_device_module(self._device), "current_stream", None)
+        if stream is None:
+            event.record()
+        else:
+            event.record(stream(self._device))
+        return event
 
     def read(self, all_but: int = 0) -> Iterator[Numbers]:
         """Those that were sent and not read yet, but for the last so many: waits until they are there."""
         while len(self._sent) > all_but:
-            counts, numbers = self._sent.popleft()
-            values = iter(numbers.read().tolist())
+            counts, there, event = self._sent.popleft()
+            if event is not None:
+                event.synchronize()
+            values = iter(there.tolist())
             yield {name: [next(values) for _ in range(count)] for name, count in counts.items()}

@@ -25,8 +25,7 @@ from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_raster
 from abcd_ns.engine.render.loss import photometric_loss, psnr, squared_errors, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.derived_scenes import ChangedScene
-from abcd_ns.engine.store.scene import BlockScene, MemoryScene, StoredScene
+from abcd_ns.engine.store.scene import BlockScene, ChangedScene, MemoryScene, StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.train.trainer import Trainer

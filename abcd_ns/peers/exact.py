@@ -31,7 +31,7 @@ from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.space.visibility import Optics, reaches
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
-from abcd_ns.engine.train.density.worth import Judged
+from abcd_ns.engine.train.density.growing import Judged
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.train.step.batch import (

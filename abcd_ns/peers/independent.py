@@ -25,9 +25,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState, join
+from abcd_ns.engine.gaussians.block_state import BlockState, Packed, join
 from abcd_ns.engine.gaussians.initialize import PointCloud
-from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.render.z_window import TileGrid

@@ -11,9 +11,8 @@ import torch
 from plyfile import PlyData
 
 from abcd_ns.cli.export import TRANSFORMS, export, tell_rounding
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, Packed
 from abcd_ns.engine.gaussians.frames import Frame
-from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import torch
 
-from abcd_ns.engine.transfer import Download, finest, upload
+from abcd_ns.engine.transfer import StepNumbers, finest, upload
 
 
 class OnDevice(torch.Tensor):
@@ -42,4 +42,6 @@ class Event:
 def test_a_device_whose_stream_has_no_name_is_copied_from_too(monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.transfer.event_of", lambda _: Event)
     monkeypatch.setattr(torch, "get_device_module", lambda _: SimpleNamespace(Event=Event))
-    assert Download(torch.arange(3)).read().tolist() == [0, 1, 2]
+    numbers = StepNumbers(torch.device("cpu"))
+    numbers.send({"errors": list(torch.arange(3.0))})
+    assert list(numbers.read()) == [{"errors": [0.0, 1.0, 2.0]}]

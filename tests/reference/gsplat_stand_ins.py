@@ -7,23 +7,122 @@ Gradients are right. As in CUDA, what is not drawn is left uninitialised: it is 
 Only what this package uses is there: projection by cameras, lists and pictures packed, no backgrounds.
 """
 
+import functools
+import inspect
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 import torch
-from gsplat.cuda import _torch_impl
+from gsplat.cuda import _torch_impl, _wrapper
+from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
 from torch import Tensor
 
-from tests.reference.differentiable_kernel import STAND_INS, Differentiable, stands_in
-from tests.reference.gsplat_surfel_stand_ins import surfel_sigma
 from tests.reference.simulated_device import kernel
 from tests.reference.triton_stand_ins import lent_triton
 
 LOG_STOP = math.log(1e-4)
 """Of the transmittance at which drawing stops."""
+STAND_INS: dict[str, Callable] = {}
+"""By gsplat's names for them."""
+
+
+class Differentiable(torch.autograd.Function):
+    """A kernel, and another for its gradient: torch's own of the same computation, which is done again."""
+
+    @staticmethod
+    def forward(ctx: Any, compute: Callable[..., Any], *tensors: Tensor) -> Any:
+        ctx.compute = compute
+        ctx.save_for_backward(*tensors)
+        results = tuple(kernel(compute, *tensors))
+        whole = [x for x in results if not x.is_floating_point()]
+        ctx.mark_non_differentiable(*whole)
+        return results
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor | None) -> Any:
+        inputs, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
+        given = [g for g in upstream if g is not None and g.is_floating_point()]
+
+        def gradient(*tensors: Tensor) -> list[Tensor]:
+            leaves = [x.detach().requires_grad_(w) for x, w in zip(tensors, wanted, strict=False)]
+            with torch.enable_grad():
+                results = [x for x in ctx.compute(*leaves) if x.is_floating_point()]
+            asked = [x for x in leaves if x.requires_grad]
+            if not any(x.requires_grad for x in results):  # as colours of degree 0 by directions
+                return [torch.zeros_like(x) for x in asked]
+            return torch.autograd.grad(results, asked, tensors[len(leaves) :], materialize_grads=True)
+
+        found = iter(kernel(gradient, *inputs, *given))
+        return None, *(next(found) if w else None for w in wanted)
+
+
+def stands_in(**fixed: Any) -> Callable[[Callable], Callable]:
+    """Give a function the signature of gsplat's of the same name.
+
+    Args:
+        fixed: arguments that the function does not take, and the only value of each that it stands in for.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        signature = inspect.signature(getattr(_wrapper, function.__name__))
+
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            bound = signature.bind(*args, **options)
+            bound.apply_defaults()
+            given = dict(bound.arguments)
+            assert {name: given.pop(name) for name in fixed} == fixed
+            return function(**given)
+
+        STAND_INS[function.__name__] = call
+        return call
+
+    return decorate
+
+
+def place_surfels(
+    tensors: Sequence[Tensor], width: int, height: int, near_plane: float, far_plane: float
+) -> list[Tensor]:
+    """(radii, means2d, depths, ray_transforms, normals) of one camera: gsplat's own reference, but for radii.
+
+    That has no least radius, as the kernel does, and none where a disc crosses the camera's plane.
+
+    Args:
+        tensors: means, quats, scales, viewmat, K.
+    """
+    means, quats, scales, viewmat, K = tensors
+    found = _fully_fused_projection_2dgs(means, quats, scales, viewmat[None], K[None], width, height)
+    _, means2d, depths, rays, normals = (value[0] for value in found)
+    rays = rays.transpose(1, 2)  # the kernel has rows for x, y and w
+    with torch.no_grad():
+        sign = rays.new_tensor([1.0, 1.0, -1.0])
+        f = sign / (rays[:, 2].square() * sign).sum(-1)[:, None]
+        extent = means2d.square() - (rays[:, :2].square() * f[:, None]).sum(-1)
+        radii = (3 * extent.amax(-1).clamp_min(1e-4).sqrt()).ceil()
+        size = means2d.new_tensor([width, height])
+        inside = ((means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)).all(-1)
+        drawn = inside & (depths >= near_plane) & (depths <= far_plane)
+    return [torch.where(drawn, radii, 0.0).int(), means2d, depths, rays, normals]
+
+
+def by_camera(
+    place: Callable[..., Sequence[Tensor]], splats: Sequence[Tensor], viewmats: Tensor, Ks: Tensor
+) -> list[Tensor]:
+    """What `place` gives of splats and each camera, radii first: of what is drawn alone. The rest is NaN, and
+    has no gradient, not even one of 0 times infinity."""
+    found = []
+    for camera in zip(viewmats, Ks, strict=True):
+        with torch.no_grad():
+            radii = place(*splats, *camera)[0]
+        drawn = (radii > 0).nonzero()[:, 0]
+        values = place(*(x[drawn] for x in splats), *camera)[1:]
+        empty = [x.new_full((len(radii), *x.shape[1:]), torch.nan) for x in values]
+        found.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
+    return [torch.stack(values) for values in zip(*found, strict=True)]
 
 
 @stands_in(covars=None, packed=False, sparse_grad=False, radius_clip=0.0, camera_model="pinhole")
@@ -31,34 +130,37 @@ def fully_fused_projection(
     means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
     """radii [C, N], means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N] or None."""
-    options = {"eps2d": eps2d, "near_plane": near_plane, "far_plane": far_plane}
+    options = {"eps2d": eps2d, "near_plane": near_plane, "far_plane": far_plane, "calc_compensations": True}
 
-    def project(rows: slice | Tensor, means: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-        quats, scales, viewmat, K = others
-        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats[rows], scales[rows], compute_preci=False)
-        return _torch_impl._fully_fused_projection(
-            means[rows], covars, viewmat[None], K[None], width, height, **options, calc_compensations=True
-        )
+    def place(means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor) -> list[Tensor]:
+        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        camera = viewmat[None], K[None], width, height
+        return [value[0] for value in _torch_impl._fully_fused_projection(means, covars, *camera, **options)]
 
-    def _project(
-        means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor
-    ) -> Sequence[Tensor]:
-        cameras = []
-        for viewmat, K in zip(viewmats, Ks, strict=True):
-            inputs = means, quats, scales, viewmat, K
-            with torch.no_grad():
-                radii = project(slice(None), *inputs)[0][0]
-            drawn = (radii > 0).nonzero()[:, 0]
-            # Those alone: what is not drawn has no gradient, not even one of 0 times infinity.
-            values = (value[0] for value in project(drawn, *inputs)[1:])
-            empty = [means.new_full((len(means), *size), torch.nan) for size in ((2,), (), (3,))]
-            if calc_compensations:
-                empty.append(means.new_zeros(len(means)))  # gsplat initialises these alone
-            cameras.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=False))])
-        return [torch.stack(values) for values in zip(*cameras, strict=True)]
+    def _project(*tensors: Tensor) -> list[Tensor]:
+        *found, compensations = by_camera(place, tensors[:3], *tensors[3:])
+        if calc_compensations:
+            found.append(torch.where(found[0] > 0, compensations, 0.0))  # gsplat initialises these alone
+        return found
 
     found = Differentiable.apply(_project, means, quats, scales, viewmats, Ks)
     return found if calc_compensations else (*found, None)
+
+
+@stands_in(eps2d=0.3, radius_clip=0.0, packed=False, sparse_grad=False)
+def fully_fused_projection_2dgs(
+    means, quats, scales, viewmats, Ks, width, height, near_plane, far_plane
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
+    CUDA, cameras get no gradient."""
+
+    def place(*tensors: Tensor) -> list[Tensor]:
+        return place_surfels(tensors, width, height, near_plane, far_plane)
+
+    def _place(*tensors: Tensor) -> list[Tensor]:
+        return by_camera(place, tensors[:3], *tensors[3:])
+
+    return Differentiable.apply(_place, means, quats, scales, viewmats.detach(), Ks.detach())
 
 
 @stands_in()
@@ -223,6 +325,15 @@ def _tiles(splats: Sequence[Tensor], offsets: Tensor, flatten_ids: Tensor, side:
     drawn = torch.cat((colors, torch.ones_like(opacities)[:, None]), dim=1)
     image = drawn.new_zeros(len(first), side * side, drawn.shape[1])
     return image.index_add(0, tile, weight[..., None] * drawn[:, None])
+
+
+def surfel_sigma(offset: Tensor, rays: Tensor, pixels: Tensor) -> Tensor:
+    """[pairs, pixels] from the boxes' middles less the pixels, ray transforms, and the pixels."""
+    u, v, w = (row[:, None] for row in rays.unbind(1))
+    h_u, h_v = pixels[..., :1] * w - u, pixels[..., 1:] * w - v
+    s, t, z = torch.linalg.cross(h_u, h_v).unbind(-1)
+    on_disc = (s.square() + t.square()) / z.square()
+    return 0.5 * torch.minimum(on_disc, 2 * offset.square().sum(-1))
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityControl
-from abcd_ns.engine.train.density.worth import Judged
+from abcd_ns.engine.train.density.growing import Judged
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, final_decay, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
@@ -25,8 +25,9 @@ def train_plain(
         name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
     }
     draw, density, growth, refined = TorchRasterizer(), DensityControl(config.density), {}, 0
-    for taken, (row, degree) in enumerate(_rows(views, steps, config)):
-        view = views[row]
+    for taken in range(steps):
+        row = endless_order(tuple(range(len(views))), taken, config.seed)
+        view, degree = views[row], sh_degree_at(taken / steps, config.recipe.sh_ramp, config.sh_degree)
         share = final_decay(taken / steps, taken) * rates_of_under_trained(taken, 1)
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.recipe.means_lr_decay) if name == "means" else 1.0
@@ -59,9 +60,3 @@ def train_plain(
         growth, refines = density.after_step(params, adam, growth, (raster.info,), judged, clock)
         refined = clock.steps if refines else refined
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
-
-
-def _rows(views: list[View], steps: int, config: TrainingConfig):
-    for taken in range(steps):
-        degree = sh_degree_at(taken / steps, config.recipe.sh_ramp, config.sh_degree)
-        yield endless_order(tuple(range(len(views))), taken, config.seed), degree

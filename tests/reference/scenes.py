@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, attach, nothing_active
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
@@ -27,6 +27,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.training_loop import train
@@ -36,6 +37,8 @@ from abcd_ns.lab.world.world import look_at
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 """So that runs of a few dozen steps grow."""
+UNPRUNED = dataclasses.replace(GROWING, min_contribution=0.0)
+"""The same, and nothing is pruned for what it contributes."""
 
 
 def random_gaussians(
@@ -84,6 +87,10 @@ class Photos:
     def __call__(self, index: int, crop: Crop) -> Tensor:
         return self.images[index][crop.slices]
 
+    def target(self, sample: Sample) -> Target:
+        """What a sample's picture should be."""
+        return sample.reduced(self(sample.view.index, sample.source)), None
+
 
 def make_coordinator(
     folder,
@@ -117,10 +124,12 @@ def make_coordinator(
     else:
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
+        deferred = {}
         if coarse_model is not None:
             gaussians, others = split_off(gaussians, coarse_model, seed=0)
-            store.commit({DEFERRED: pack_points(points_of(others))})
-        store.commit(content(tree, gaussians))
+            fields = others.means, others.scales[:, :1], others.quats, others.features_dc, others.sh_degree
+            deferred = {DEFERRED: pack_points(PointCloud(*fields))}
+        store.commit({**deferred, **dict(content(tree, gaussians))})  # at once: this may be killed
     config = training_config(sh_degree=gaussians.sh_degree, **training)
     run = TrainingRun(
         config,
@@ -145,12 +154,6 @@ def activated(gaussians: Gaussians) -> tuple[Params, Optimizers]:
     return params, optimizers
 
 
-def points_of(gaussians: Gaussians) -> PointCloud:
-    """Points where Gaussians are, as a run begins with them."""
-    fields = (gaussians.means, gaussians.scales[:, :1], gaussians.quats, gaussians.features_dc)
-    return PointCloud(*fields, gaussians.sh_degree)
-
-
 def training_config(**options) -> TrainingConfig:
     """Options of TrainingConfig, and of its recipe and limits, each by its own name; visits are short, and
     steps no larger than 3DGS's: a few dozen of them leave a scene near what it was."""
@@ -171,6 +174,16 @@ def whole_scene(coordinator: Coordinator) -> Gaussians:
 def equal(one: Gaussians, other: Gaussians) -> bool:
     """To the last bit, row by row."""
     return all(torch.equal(value, getattr(other, name)) for name, value in one.items())
+
+
+def assert_same_state(one: BlockState, other: BlockState) -> None:
+    """To the last bit: parameters, moments, statistics, clocks."""
+    for part in ("gaussians", *MOMENTS):
+        ours, theirs = (dict(getattr(state, part).items()) for state in (one, other))
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(one.growth, other.growth, rtol=0, atol=0)
+    assert torch.equal(one.deferred, other.deferred)
+    assert one.clocks == other.clocks
 
 
 def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:

@@ -8,7 +8,7 @@ import torch
 
 from abcd_ns.engine.events import BlockSplit, PrunedAtEnd
 from abcd_ns.engine.gaussians.block_state import MOMENTS
-from abcd_ns.engine.store.derived_scenes import HeldScene
+from abcd_ns.engine.store.scene import HeldScene
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train

@@ -98,7 +98,7 @@ def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
     and those held out; none where the data is gone."""
     tree, means = checkpoint.tree, checkpoint.means.double().numpy()
     centers = [found.camera_to_worlds[:, :3, 3].cpu().double().numpy() for found in cameras]
-    planes = [(0, 1), (0, 2)] if bool((tree.axis == 2).any()) else [(0, 1)]
+    planes = [(0, 1), (0, 2)] if any(axis == 2 for axis, *_ in tree.rows) else [(0, 1)]
     figure = Figure(figsize=(WIDTH, WIDTH / len(planes)), layout="constrained")
     for axes, plane in zip(figure.subplots(1, len(planes), squeeze=False)[0], planes, strict=True):
         ends = np.quantile(means[:, plane], SHOWN, axis=0)

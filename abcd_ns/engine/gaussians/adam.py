@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from abcd_ns.engine.kernels.native import address, library, suits
 
@@ -29,19 +28,13 @@ class Adam(torch.optim.Adam):
         if self.counts:
             torch._foreach_add_(parts[-1], 1)
         is_plain = not (group["weight_decay"] or group["amsgrad"] or group["maximize"])
+        beta1, beta2 = group["betas"]
         if is_plain and suits(*parts[0], *parts[1]):
-            for each in zip(*parts[:4], parts[-1], strict=True):
-                _step_natively(*each, group)
+            for value, *others, count in zip(*parts[:4], parts[-1], strict=True):
+                steps, eps = float(count), group["eps"]
+                rates = group["lr"] / (1 - beta1**steps), beta1, beta2, math.sqrt(1 - beta2**steps), eps
+                library().abcd_adam(value.numel(), *map(address, (value, *others)), *rates)
             return
         names = ("lr", "weight_decay", "eps", "amsgrad", "maximize")
-        options = {name: group[name] for name in names}
-        options["beta1"], options["beta2"] = group["betas"]
+        options = {name: group[name] for name in names} | {"beta1": beta1, "beta2": beta2}
         torch._fused_adam_(*parts, **options, grad_scale=None, found_inf=getattr(self, "found_inf", None))
-
-
-def _step_natively(
-    value: Tensor, grad: Tensor, first: Tensor, second: Tensor, count: Tensor, group: dict[str, Any]
-) -> None:
-    (beta1, beta2), steps = group["betas"], float(count)
-    rates = (group["lr"] / (1 - beta1**steps), beta1, beta2, math.sqrt(1 - beta2**steps), group["eps"])
-    library().abcd_adam(value.numel(), *map(address, (value, grad, first, second)), *rates)

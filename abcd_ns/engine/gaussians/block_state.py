@@ -1,18 +1,80 @@
-"""All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
+"""All that belongs to one block, and how it is kept: Gaussians, Adam moments, growth statistics, clocks."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.packed import IS_DEFERRED, Packed, pack
-from abcd_ns.engine.types import Gaussians, as_indices
+from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use, up_to_degree
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians, as_indices
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Adam's running moments, under torch's names."""
+IS_DEFERRED, DEGREES = "waits", "degrees"
+"""Columns: which Gaussians are deferred; the highest degree in use of each one's harmonics, and moments."""
+DRAWN = (*PARAM_NAMES, IS_DEFERRED, DEGREES)
+"""What is needed of a block to draw it."""
+
+
+class Packed(NamedTuple):
+    """A block, or some columns of it, as a store takes it; or a table of the run's, of no Gaussians.
+
+    In training `features_rest` and its moments are [n, k, 3]. Here they are [m, 3], without the zeros beyond
+    each Gaussian's degree: the coefficients of the first Gaussian, then those of the second, as many each as
+    the column `degrees` says.
+    """
+
+    tensors: dict[str, Tensor]
+    """Nobody changes them any more."""
+    meta: dict[str, Any]
+    """JSON. Of a block, `coefficients` is k; `parameters`, of how many numbers its Gaussians are."""
+
+    @property
+    def rows(self) -> int:
+        """Gaussians."""
+        return len(self.tensors["means"])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        return sum(value.nbytes for value in self.tensors.values())
+
+    def gaussians(self, before: str = "", device: torch.device | str = "cpu") -> Gaussians:
+        """As they are drawn; or their moments, whose names have something before them. Unpacked on a device,
+        which is sent no zeros."""
+        values = {name: self.tensors[before + name].to(device) for name in PARAM_NAMES}
+        packed, coefficients = values["features_rest"], self.meta["coefficients"]
+        rest = packed.new_zeros(len(values["means"]), coefficients, 3)
+        rest[up_to_degree(self.tensors[DEGREES].to(device), coefficients)] = packed
+        return Gaussians(**{**values, "features_rest": rest})
+
+    def drawn_at(self, rows: Bool[Tensor, "n"]) -> "Packed":
+        """Some Gaussians, as others draw them; `parameters` stays that of all."""
+        kept = rows.repeat_interleave((self.tensors[DEGREES].long() + 1).square() - 1)
+        chosen = {name: self.tensors[name][kept if name == "features_rest" else rows] for name in DRAWN}
+        return Packed(chosen, self.meta)
+
+    def part(self, names: set[str]) -> "Packed":
+        """Some columns."""
+        return Packed({name: value for name, value in self.tensors.items() if name in names}, self.meta)
+
+
+def pack(parts: Mapping[str, Gaussians]) -> Packed:
+    """Gaussians, by "", and what else is shaped as they are, by what is set before the names."""
+    degrees = degrees_in_use([part.features_rest for part in parts.values()])
+    coefficients = parts[""].features_rest.shape[1]
+    kept = up_to_degree(degrees, coefficients)
+    tensors = {
+        before + name: value[kept] if name == "features_rest" else value
+        for before, part in parts.items()
+        for name, value in part.items()
+    }
+    parameters = sum(tensors[name].numel() for name in PARAM_NAMES)
+    return Packed({**tensors, DEGREES: degrees}, {"coefficients": coefficients, "parameters": parameters})
 
 
 @dataclass(frozen=True)
@@ -65,8 +127,8 @@ class BlockState:
     @staticmethod
     def fresh(gaussians: Gaussians) -> "BlockState":
         """A block that has not been trained: zero moments, clocks at zero."""
-        zeros = Gaussians(**{name: torch.zeros_like(value) for name, value in gaussians.items()})
-        return BlockState(gaussians, zeros, Gaussians(**{n: v.clone() for n, v in zeros.items()}))
+        moments = (Gaussians(*(torch.zeros_like(value) for _, value in gaussians.items())) for _ in MOMENTS)
+        return BlockState(gaussians, *moments)
 
     def __getitem__(self, rows: Tensor | slice) -> "BlockState":
         """The Gaussians at `rows` with all that belongs to them; the clocks stay the block's."""

@@ -76,7 +76,6 @@ def cloud_from_points(
     colors: UInt8[Tensor, "n 3"] | Float[Tensor, "n 3"],
     *,
     sh_degree: int = 3,
-    seed: int = 0,
     flat: bool = False,
 ) -> PointCloud:
     """Isotropic Gaussians at `points`, as wide as the mean distance to the three nearest others.
@@ -85,7 +84,6 @@ def cloud_from_points(
         points: world space; rows that are not finite are dropped with a warning. Another warns where the
             points are too few.
         colors: 0..255.
-        seed: of the random rotations.
         flat: make them discs of THICKNESS.
     """
     keep = torch.isfinite(points).all(dim=1)
@@ -103,7 +101,7 @@ def cloud_from_points(
     return PointCloud(
         means=points,
         scales=spacing(points).log_()[:, None],
-        quats=_random_quats(count, torch.Generator().manual_seed(seed)).to(points.dtype),
+        quats=_random_quats(count).to(points.dtype),
         features_dc=colors.to(points.dtype).div(255).sub_(0.5).div_(SH_C0),
         sh_degree=sh_degree,
         flat=flat,
@@ -210,10 +208,10 @@ def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Ten
     return points, torch.rand((count, 3), generator=generator) * 255
 
 
-def _random_quats(count: int, generator: torch.Generator) -> Float[Tensor, "n 4"]:
-    """Uniform random rotations (Shoemake, "Uniform random rotations", Graphics Gems III)."""
+def _random_quats(count: int) -> Float[Tensor, "n 4"]:
+    """Uniform random rotations (Shoemake, "Uniform random rotations", Graphics Gems III); always the same."""
     quats, tau = torch.empty(count, 4), 2 * math.pi
-    uniform = torch.rand((3, count), generator=generator)
+    uniform = torch.rand((3, count), generator=torch.Generator().manual_seed(0))
     for found, (u, v, w) in zip(quats.split(CHUNK), uniform.split(CHUNK, dim=1), strict=True):
         a, b = torch.sqrt(1 - u), torch.sqrt(u)
         v, w = tau * v, tau * w

@@ -258,7 +258,7 @@ class LayerRenderer:
             fold: makes one of a near and a far part, if they are something else.
         """
         while node:
-            node = int(self.tree.parent[node])
+            node = self.tree.parent[node]
             near, far = node_children_in_order(self.tree, node, seen.center)
             if near not in parts or far not in parts:
                 return
@@ -311,8 +311,9 @@ class LayerRenderer:
         if len(leaves) == 1 or (whole and fits):
             yield node
             return
-        yield from self._descend(int(self.tree.left[node]), exclude)
-        yield from self._descend(int(self.tree.right[node]), exclude)
+        _, _, left, right, _ = self.tree.rows[node]
+        yield from self._descend(left, exclude)
+        yield from self._descend(right, exclude)
 
 
 def drawn_over(front: Raster, behind: Raster) -> Raster:

@@ -6,7 +6,7 @@ from itertools import count
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, tree_from_rows
+from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box
 
 MAX_BLOCKS = 65_536
 """The most blocks that space may be cut into to begin with, and the most cells of a grid: far more than any
@@ -153,7 +153,7 @@ def _flatten(nested: tuple | None) -> BlockTree:
         return node
 
     add(nested)
-    return tree_from_rows(rows)
+    return BlockTree(tuple(rows))
 
 
 def _check_finite(points: Tensor) -> None:

@@ -15,14 +15,14 @@ from torch import Tensor
 from abcd_ns.engine.types import CHUNK
 
 _Index = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 31)]
+Row = tuple[_Index, float, _Index, _Index, _Index]
 
 
 class _Stored(msgspec.Struct):
     """A tree as JSON has it."""
 
     format: Literal["abcd_ns.block_tree/1"]
-    nodes: list[tuple[_Index, float, _Index, _Index, _Index]]
-    """(axis, threshold, left, right, block) of each."""
+    nodes: tuple[Row, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,74 +50,66 @@ class Box:
 EVERYWHERE = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class BlockTree:
-    """A k-d tree over all of R^3 with one block at each leaf; all tensors live on the CPU.
+    """A k-d tree over all of R^3 with one block at each leaf.
 
     A point with x[axis] < threshold belongs to the left child, any other to the right one, compared in
     float64 (which holds every float32 exactly). So the cells overlap nowhere and leave nothing out. Node 0
     is the root, every node comes after its parent, and a tree of one block is a single leaf.
 
     Raises:
-        ValueError: the arrays are no such tree, or a threshold lies outside its node's box.
+        ValueError: the rows are no such tree, or a threshold lies outside its node's box.
     """
 
-    axis: Int64[Tensor, "m"]
-    """The axis that an inner node splits, 0 to 2; -1 for a leaf."""
-    threshold: Float64[Tensor, "m"]
-    """Where it splits, world units; 0 for a leaf."""
-    left: Int64[Tensor, "m"]
-    """The child below the threshold; -1 for a leaf."""
-    right: Int64[Tensor, "m"]
-    """The child at and above the threshold; -1 for a leaf."""
-    block: Int64[Tensor, "m"]
-    """A leaf's block, 0 to num_blocks - 1; -1 for an inner node."""
+    rows: tuple[Row, ...]
+    """Of an inner node (axis, threshold, left, right, -1): the axis that it splits, 0 to 2, where, world
+    units, and its children below the threshold and not below it. Of a leaf (-1, 0.0, -1, -1, block); blocks
+    are 0 to num_blocks - 1."""
 
     def __post_init__(self) -> None:
-        if not _is_tree(self):
+        if not _is_tree(self.rows):
             wanted = "a binary tree, parents first, with blocks 0 to K - 1 at its leaves"
             raise ValueError(f"block tree: not {wanted}")
-        lower, upper = self._bounds
-        node = (self.axis >= 0).nonzero()[:, 0]
-        axis, threshold = self.axis[node], self.threshold[node]
-        cuts = (lower[node, axis] < threshold) & (threshold < upper[node, axis])
-        if not bool(cuts.all()):
-            raise ValueError(f"block tree: node {int(node[~cuts][0])} has a threshold outside its own box")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, BlockTree) and self.to_json() == other.to_json()
-
-    def __hash__(self) -> int:
-        return hash(self.to_json())
+        for node, (axis, threshold, *_) in enumerate(self.rows):
+            lower, upper = self._bounds[node]
+            if axis >= 0 and not lower[axis] < threshold < upper[axis]:
+                raise ValueError(f"block tree: node {node} has a threshold outside its own box")
 
     @property
     def num_blocks(self) -> int:
-        return (self.axis.shape[0] + 1) // 2
+        return (len(self.rows) + 1) // 2
 
     @cached_property
-    def parent(self) -> Int64[Tensor, "m"]:
-        """-1 for the root."""
-        inner, parent = (self.axis >= 0).nonzero()[:, 0], torch.full_like(self.axis, -1)
-        parent[self.left[inner]] = parent[self.right[inner]] = inner
-        return parent
+    def parent(self) -> list[int]:
+        """Of each node; -1 for the root."""
+        found = [-1] * len(self.rows)
+        for node, (_, _, left, right, _) in enumerate(self.rows):
+            if left >= 0:
+                found[left] = found[right] = node
+        return found
 
     @cached_property
-    def _bounds(self) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
+    def _bounds(self) -> list[tuple[list[float], list[float]]]:
         """The lower and upper corners of all nodes' boxes."""
-        lower, upper = [[-math.inf] * 3], [[math.inf] * 3]
-        axis, threshold, left = self.axis.tolist(), self.threshold.tolist(), self.left.tolist()
-        for node, parent in enumerate(self.parent.tolist()[1:], start=1):
-            lower.append(list(lower[parent]))
-            upper.append(list(upper[parent]))
-            side = upper if left[parent] == node else lower
-            side[node][axis[parent]] = threshold[parent]
-        return torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
+        found = [([-math.inf] * 3, [math.inf] * 3)]
+        for node, parent in enumerate(self.parent[1:], start=1):
+            axis, threshold, left, _, _ = self.rows[parent]
+            lower, upper = map(list, found[parent])
+            side = upper if left == node else lower
+            side[axis] = threshold
+            found.append((lower, upper))
+        return found
 
     @cached_property
-    def rows(self) -> list[tuple[int, float, int, int, int]]:
-        """(axis, threshold, left, right, block) of each node, as Python numbers."""
-        columns = (self.axis, self.threshold, self.left, self.right, self.block)
-        return list(zip(*(column.tolist() for column in columns), strict=True))
+    def _columns(self) -> tuple[Tensor, ...]:
+        """The rows as tensors on the CPU, one for each kind of number."""
+        axis, threshold, *others = torch.tensor(self.rows, dtype=torch.float64).unbind(dim=1)
+        return axis.long(), threshold, *(column.long() for column in others)
+
+    @cached_property
+    def _leaf_of(self) -> dict[int, int]:
+        return {block: node for node, (_, _, _, _, block) in enumerate(self.rows) if block >= 0}
 
     def assign(self, points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
         """The block that holds each point, on the points' device. A NaN goes to the right."""
@@ -126,8 +118,7 @@ class BlockTree:
     def _assign(self, points: Tensor) -> Tensor:
         exact = in_float64(points)
         device = exact.device
-        axis, threshold = self.axis.to(device), self.threshold.to(device)
-        left, right, block = self.left.to(device), self.right.to(device), self.block.to(device)
+        axis, threshold, left, right, block = (column.to(device) for column in self._columns)
         node = torch.zeros(len(points), dtype=torch.int64, device=device)
         while bool((axis[node] >= 0).any()):
             along = axis[node]
@@ -138,14 +129,14 @@ class BlockTree:
 
     def node_of(self, block: int) -> int:
         """The leaf of a block."""
-        if not 0 <= block < self.num_blocks:
+        if block not in self._leaf_of:
             raise ValueError(f"block {block} does not exist: the tree has blocks 0 to {self.num_blocks - 1}")
-        return int((self.block == block).nonzero()[0, 0])
+        return self._leaf_of[block]
 
     def box(self, node: int) -> Box:
         """The part of space under a node; all of it for the root."""
-        lower, upper = self._bounds
-        return Box(lower[node].clone(), upper[node].clone())
+        lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in self._bounds[node])
+        return Box(lower, upper)
 
     def cell(self, block: int) -> Box:
         """The part of space that a block holds."""
@@ -171,7 +162,7 @@ class BlockTree:
         """
         node, rows = self.node_of(block), list(self.rows)
         rows[node] = (axis, float(threshold), len(rows), len(rows) + 1, -1)
-        return tree_from_rows([*rows, (-1, 0.0, -1, -1, block), (-1, 0.0, -1, -1, self.num_blocks)])
+        return BlockTree((*rows, (-1, 0.0, -1, -1, block), (-1, 0.0, -1, -1, self.num_blocks)))
 
     def to_json(self) -> str:
         """As text that from_json turns back into the same tree, bit for bit."""
@@ -186,7 +177,7 @@ class BlockTree:
             ValueError: the text is not JSON, not of this format, or describes no tree.
         """
         try:
-            return tree_from_rows(msgspec.json.decode(text, type=_Stored).nodes)
+            return BlockTree(msgspec.json.decode(text, type=_Stored).nodes)
         except msgspec.MsgspecError as error:
             raise ValueError(f"block tree: {error}") from error
 
@@ -221,28 +212,19 @@ def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...
     return tuple(block for block in blocks if block >= 0)
 
 
-def tree_from_rows(rows: Sequence[Sequence[int | float]]) -> BlockTree:
-    """A tree from (axis, threshold, left, right, block) of each node."""
-    axis, threshold, *rest = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(dim=1)
-    return BlockTree(axis.long(), threshold.clone(), *(column.long() for column in rest))
-
-
-def _is_tree(tree: BlockTree) -> bool:
-    """Whether the arrays form one binary tree, parents first, with each block at one leaf."""
-    size = tree.axis.shape[0]
-    inner = tree.axis >= 0
-    children = torch.cat([tree.left[inner], tree.right[inner]])
+def _is_tree(rows: Sequence[Row]) -> bool:
+    """Whether the rows form one binary tree, parents first, with each block at one leaf."""
+    inner = [(node, row) for node, row in enumerate(rows) if row[0] >= 0]
+    leaves = [row for row in rows if row[0] < 0]
+    children = [(child, node) for node, row in inner for child in row[2:4]]
     # Every node but the root is the child of exactly one earlier node: then there are no cycles or islands.
-    if size == 0 or sorted(children.tolist()) != list(range(1, size)):
-        return False
-    parents = inner.nonzero()[:, 0].repeat(2)
-    leaves = torch.stack([tree.axis + 1, tree.left + 1, tree.right + 1, tree.threshold != 0])[:, ~inner]
-    return bool(
-        (children > parents).all()
-        and (tree.axis <= 2).all()
-        and (tree.block[inner] == -1).all()
-        and not leaves.any()
-        and sorted(tree.block[~inner].tolist()) == list(range((size + 1) // 2))
+    return (
+        len(rows) > 0
+        and sorted(child for child, _ in children) == list(range(1, len(rows)))
+        and all(child > node for child, node in children)
+        and all(row[0] <= 2 and row[4] == -1 for _, row in inner)
+        and all(row[:4] == (-1, 0.0, -1, -1) for row in leaves)
+        and sorted(row[4] for row in leaves) == list(range(len(leaves)))
     )
 
 

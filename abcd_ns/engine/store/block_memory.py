@@ -2,7 +2,7 @@
 
 from collections import OrderedDict
 
-from abcd_ns.engine.gaussians.packed import DRAWN, Packed
+from abcd_ns.engine.gaussians.block_state import DRAWN, Packed
 from abcd_ns.engine.store.special_blocks import BlockName
 
 

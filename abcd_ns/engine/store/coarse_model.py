@@ -12,9 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, Packed
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
-from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.special_blocks import DEFERRED, BlockName
 from abcd_ns.engine.types import Gaussians

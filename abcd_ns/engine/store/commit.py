@@ -6,9 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, Packed, join
 from abcd_ns.engine.gaussians.initialize import PointCloud
-from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.store.coarse_model import by_block, defer, pack_points, split_by_block
 from abcd_ns.engine.store.scene import StoredScene, VisitScene
 from abcd_ns.engine.store.special_blocks import ACTIVE, DEFERRED, PENDING, WHOLE, BlockName

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.gaussians.block_state import Packed
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.special_blocks import BlockName
 

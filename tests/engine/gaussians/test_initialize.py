@@ -92,12 +92,6 @@ def test_surfels_begin_flat_and_stay_so_where_they_are_widened():
     assert bool((chosen.gaussians().scales[:, :2] > discs.scales.mean()).all())
 
 
-def cloud(count: int, seed: int, width: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    points = (torch.rand(count, 3, generator=generator) - 0.5) * width
-    return points, torch.rand(count, 3, generator=generator) * 255
-
-
 def test_a_pixel_is_as_wide_as_the_nearest_view_that_sees_the_point_has_it():
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.2, 0.1], [0.0, 0.0, 90.0]])
     found = finest_pixel(points, VIEWS)
@@ -113,7 +107,7 @@ def test_a_pixel_is_as_wide_as_the_nearest_view_that_sees_the_point_has_it():
 
 
 def test_points_that_nobody_sees_stay_and_so_do_all_at_0():
-    points, colors = cloud(40, 4, width=1e-4)
+    points, colors = random_points(40, 1e-4, seed=4)
     unseen = points + torch.tensor([0.0, 0.0, 500.0])
     assert len(thin_points(unseen, colors, VIEWS, 2.0)[0]) == 40
     assert thin_points(points, colors, VIEWS, 0.0)[0] is points
@@ -132,7 +126,7 @@ def by_cube(points, colors, pixels: float) -> dict[tuple, list[torch.Tensor]]:
 @pytest.mark.parametrize("chunk", [7, 1000])
 def test_points_of_a_cube_become_their_mean_cubes_in_order(monkeypatch, chunk):
     monkeypatch.setattr("abcd_ns.engine.gaussians.initialize.CHUNK", chunk)
-    points, colors = cloud(200, 6, width=0.3)
+    points, colors = random_points(200, 0.3, seed=6)
     points[::11] += 400.0  # unseen
     cubes = by_cube(points, colors, 3.0)
     found = torch.cat(thin_points(points, colors, VIEWS, 3.0), dim=1)

@@ -10,8 +10,7 @@ from abcd_ns.engine.layers.surface import NEARER, colored_by_normal, fog_in_whit
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.derived_scenes import ChangedScene
-from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
 from abcd_ns.engine.types import View
 from tests.reference.naive_rasterizer import rotation
 from tests.reference.scenes import random_gaussians, ring_of_views

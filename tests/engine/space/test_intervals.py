@@ -88,8 +88,8 @@ def test_the_window_is_the_one_of_the_cell_that_holds_the_point(seed, dtype):
             pixel = torch.tensor([column + 0.5, row + 0.5, 1.0], dtype=torch.float64)
             in_camera = torch.linalg.inv(view.K.double()) @ pixel * z[row, column]
             point = inverse[:3, :3] @ in_camera + inverse[:3, 3]
-            inner = tree.axis >= 0
-            if (point[tree.axis[inner]] - tree.threshold[inner]).abs().min() < 1e-4:
+            planes = [(axis, threshold) for axis, threshold, *_ in tree.rows if axis >= 0]
+            if min(abs(point[axis] - threshold) for axis, threshold in planes) < 1e-4:
                 continue
             block = int(tree.assign(point[None]))
             assert near[block, row, column] <= z[row, column] < far[block, row, column]

@@ -12,10 +12,8 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.coarse_model import REVEALED_OPACITY, stored_blocks
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference import scenes
-from tests.reference.scenes import STILL, listen, whole_scene
+from tests.reference.scenes import STILL, UNPRUNED, equal, listen, whole_scene
 
-GROWING = replace(scenes.GROWING, min_contribution=0.0)
 LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 """Enough for growth."""
 
@@ -36,7 +34,7 @@ def test_a_store_begins_with_each_point_in_its_block_or_deferred():
     owner, whole = tree.assign(coarse.means), coarse.gaussians()
     for block, packed in content.items():
         state = BlockState.unpacked(packed)
-        assert scenes.equal(state.gaussians, whole[owner == block])
+        assert equal(state.gaussians, whole[owner == block])
         assert not bool(state.deferred.any() | state.exp_avg.means.any() | state.exp_avg_sq.quats.any())
     assert list(content) == [0, 1, 2, 3]
 
@@ -101,7 +99,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, phot
 @pytest.mark.parametrize("most", [0, 125, 400])
 def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
-    coordinator = make(**LONG, coarse_model=len(start), coarse_gaussians=most, density=GROWING)
+    coordinator = make(**LONG, coarse_model=len(start), coarse_gaussians=most, density=UNPRUNED)
     train(coordinator, photos, steps=29)
     active = len(coordinator.params["means"])
     assert active == coordinator.count()
@@ -113,7 +111,7 @@ def test_the_coarse_model_grows_while_there_is_room_for_it(make, photos, start, 
 
 
 def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
-    density = replace(GROWING, max_gaussians=len(start))
+    density = replace(UNPRUNED, max_gaussians=len(start))
     coordinator = make(**LONG, coarse_model=60, coarse_gaussians=100, density=density)
     train(coordinator, photos, steps=29)
     assert len(coordinator.params["means"]) <= 60
@@ -144,7 +142,7 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
 
 
 def test_a_visit_in_which_deferred_points_join_prunes_none(make, photos):
-    density = replace(GROWING, min_contribution=1e9, refine_stop=0.0)
+    density = replace(UNPRUNED, min_contribution=1e9, refine_stop=0.0)
     coordinator = make(blocks=2, steps=400, coarse_model=30, warmup=0.1, density=density)
     ended, counts = listen(coordinator, VisitEnded), {}
     while len(ended) < 4:

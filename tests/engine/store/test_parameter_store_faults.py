@@ -4,7 +4,6 @@ and has one writer and any number of readers."""
 import errno
 import json
 import os
-import resource
 import shutil
 import signal
 import struct
@@ -16,8 +15,7 @@ import pytest
 
 from abcd_ns.engine.store import FolderLockedError, ParameterStore, StoreError, atomic, shard
 from abcd_ns.engine.store.manifest import manifest_path
-from tests.engine.store.disks import wait_until
-from tests.reference.store_helpers import FailAt, assert_block, block, names_in
+from tests.reference.store_helpers import FailAt, assert_block, block, names_in, wait_until
 
 FAULTS = [(atomic.os, "replace", 3), (atomic.os, "fsync", 5), (shard, "save_file", 2)]
 """What a commit of two blocks calls, and how often."""
@@ -69,23 +67,6 @@ def test_a_disk_that_stays_broken_leaves_one_whole_generation(store, monkeypatch
         assert not list(store.folder.glob(".*"))
         if view.generation != 1:
             return
-
-
-def test_a_disk_that_is_full_at_any_byte_leaves_the_previous_generation(store):
-    """RLIMIT_FSIZE makes every write beyond a size fail, in Python, in safetensors, wherever it happens."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    sizes = {path.name: path.stat().st_size for path in store.folder.iterdir()}
-    try:
-        for limit in (0, 1, 100, 300, sizes["manifest.json"] - 1, max(sizes.values()) - 1):
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-            with pytest.raises(StoreError, match=r"generation 2 failed: .* holds generation 1, intact"):
-                store.commit({0: block(5, 8.0), 4: block(40, 8.0)}, state={"clock": 6})
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-            assert_intact(store)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert store.commit({0: block(5, 8.0)}) == 2
-    assert_block(store, 0, 5, 8.0)
 
 
 def test_an_interrupt_is_no_commit(store, monkeypatch):

@@ -19,8 +19,8 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from tests.engine.store.disks import PATIENCE, Disk, on_disk, wait_until
-from tests.reference.scenes import STILL, equal, listen, random_gaussians, stop
+from tests.reference.scenes import STILL, assert_same_state, equal, listen, random_gaussians, stop
+from tests.reference.store_helpers import PATIENCE, Disk, on_disk, wait_until
 
 SOON = 1e-6
 """Seconds."""
@@ -45,13 +45,6 @@ def persist(scene: StoredScene, step: int, *blocks: int, within: float = PATIENC
     """Persist blocks, each with one Gaussian fewer."""
     fewer = {block: BlockState.fresh(scene.state(block).gaussians[1:]) for block in blocks}
     scene.persist(scene.tree, fewer, {"step": step}, within=within)
-
-
-def persist_aside(scene: StoredScene, *args) -> threading.Thread:
-    """`scene.persist` in a thread of its own, since it may have to wait."""
-    thread = threading.Thread(target=scene.persist, args=(scene.tree, *args), daemon=True)
-    thread.start()
-    return thread
 
 
 def hold_up(scene: StoredScene, disk: Disk, step: int, block: int) -> None:
@@ -117,7 +110,9 @@ def test_what_waits_never_takes_more_ram_than_there_is(scene, disk):
     scene.persist(scene.tree, {0: scene.state(0)}, {"step": 1}, within=PATIENCE)
     assert disk.commits == []
     disk.free.clear()
-    thread = persist_aside(scene, {1: scene.state(1)}, {"step": 2}, PATIENCE)
+    given = scene.tree, {1: scene.state(1)}, {"step": 2}, PATIENCE
+    thread = threading.Thread(target=scene.persist, args=given, daemon=True)  # it has to wait
+    thread.start()
     assert disk.asked.wait(PATIENCE)
     assert thread.is_alive()
     disk.free.set()
@@ -165,12 +160,8 @@ def test_a_write_that_failed_is_told_once_and_made_good_by_the_next(scene, disk)
     scene.flush()
     assert disk.commits == [({0, 1}, {"step": 2})]
     again = StoredScene(scene.tree, ParameterStore.open(scene.store.folder, read_only=True))
-    assert all(same(again.state(block), scene.state(block)) for block in range(4))
-
-
-def same(a: BlockState, b: BlockState) -> bool:
-    (first, meta), (second, other) = a.packed(), b.packed()
-    return meta == other and all(torch.equal(value, second[name]) for name, value in first.items())
+    for block in range(4):
+        assert_same_state(again.state(block), scene.state(block))
 
 
 def test_a_fork_waits_for_the_write_and_the_child_can_read(scene, disk):
@@ -247,7 +238,7 @@ def test_pending_migrants_are_drawn_survive_a_stop_and_join(make, photos):
     assert len(coordinator.scene.gaussians(block)) == coordinator.scene.count(block) == len(expected) > rows
     stop(coordinator)
     again = make(resume=True, **options)
-    assert same(with_pending(again.scene, block), expected)
+    assert_same_state(with_pending(again.scene, block), expected)
     begun = listen(again, VisitBegan)
     while not begun or begun[-1].block != block:
         train_step(again, photos)

@@ -1,4 +1,4 @@
-"""Visits: gradients, nothing lost, exact resumption, and that one block is plain 3DGS."""
+"""Visits: gradients, nothing lost, exact resumption, one block is plain 3DGS; scenes of all kinds."""
 
 import math
 from dataclasses import replace
@@ -7,32 +7,38 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import EpochEnded, LayersDrawn, StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.layers.compositing import composite, fold
+from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.store.commit import with_pending
 from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, WHOLE
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.health import unsound
 from abcd_ns.engine.train.run_state import BlockHealth, Budget, RunState
+from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
-from tests.reference.rasterizer_scenes import drawn
+from tests.reference.rasterizer_scenes import as_leaves, drawn
 from tests.reference.scenes import (
     GROWING,
     STILL,
+    UNPRUNED,
+    Photos,
     assert_resumes,
     equal,
     listen,
+    make_coordinator,
     random_gaussians,
     ring_of_views,
     whole_scene,
 )
 
-BOTH = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
-
 
 @pytest.mark.parametrize(("growing", "layers"), [(True, True), (False, False)], ids=["growing", "ablated"])
 def test_one_block_is_plain_3dgs_bit_for_bit(make, views, photos, start, growing, layers):
-    density = replace(GROWING, min_contribution=0.0) if growing else STILL
+    density = UNPRUNED if growing else STILL
     coordinator = make(blocks=1, steps=40, density=density, layers=layers, fast_start=True)
     train(coordinator, photos)
     expected = train_plain(start, views, photos, steps=40, config=coordinator.config)
@@ -73,7 +79,7 @@ def gradient_of_whole_picture(coordinator, sample, weights, ownership) -> dict[s
     block, options = coordinator.state.active.geometry.block, {"crop": sample.crop}
     options["sh_degree"] = coordinator.run.active.sh_degree
     blocks = {b: coordinator.scene.gaussians(b) for b in range(tree.num_blocks)}
-    active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
+    active = as_leaves(blocks[block])
     if ownership == "fragments":
         others = Gaussians.cat([g for b, g in blocks.items() if b != block])
         layer = drawn(draw, active, sample.view, frozen=others, **options).layer
@@ -177,7 +183,7 @@ def test_events_tell_the_whole_story(make, photos):
 
 def test_a_limit_on_gaussians_is_kept_at_every_step(make, photos, start):
     limit = len(start) + 15
-    density = replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0, min_contribution=0.0)
+    density = replace(UNPRUNED, max_gaussians=limit, cull_alpha_thresh=0.0)
     coordinator = make(blocks=2, steps=60, density=density)
     counts = []
     while not coordinator.finished:
@@ -217,6 +223,7 @@ def test_the_state_of_a_run_survives_json(make, photos):
     assert (again.health, again.influence, again.queue) == (state.health, state.influence, state.queue)
     assert again.active.looked_at == (2,)
     assert again.active.geometry.crops == state.active.geometry.crops
+    assert RunState.from_json({"queue": [[3, 10]]}).queue == [VisitPlan(3, 10)]  # before plans had a batch
 
 
 def off_from_merged(coordinator, batch, pictures) -> list[torch.Tensor]:
@@ -262,3 +269,43 @@ def test_layers_show_what_earlier_visits_made_of_the_other_blocks(make, photos):
     coordinator.render = compared
     train(coordinator, photos)
     assert begun > 4
+
+
+# Scenes that no capture should be, and some are
+
+
+def test_pictures_of_any_size_train_together(tmp_path):
+    sizes = ((1, 1), (7, 5), (33, 17), (101, 67), (48, 36), (16, 64))
+    rings = [ring_of_views(len(sizes), width=width, height=height) for width, height in sizes]
+    views = [ring[index] for index, ring in enumerate(rings)]
+    photos = Photos(random_gaussians(60, seed=7, size=0.1), views)
+    density = DensityConfig(refine_start=0.0)
+    start = random_gaussians(60, seed=1, size=0.08)
+    coordinator = make_coordinator(tmp_path, start, views, steps=24, density=density)
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+    assert not bool(unsound(whole_scene(coordinator)).any())
+
+
+def test_a_block_inside_an_opaque_ball_is_visited_once_and_then_passed_over(tmp_path):
+    draw = {"generator": torch.Generator().manual_seed(1)}
+    shell = 0.5 * torch.nn.functional.normalize(torch.randn((900, 3), **draw), dim=1)
+    wall = cloud_from_points(shell, torch.full((900, 3), 128.0), sh_degree=1).gaussians()
+    wall = replace(
+        wall, scales=torch.full_like(wall.scales, math.log(0.08)), opacities=torch.full((900, 1), 8.0)
+    )
+    inside = cloud_from_points(
+        0.02 * torch.randn((30, 3), **draw), torch.full((30, 3), 255.0), sh_degree=1
+    ).gaussians()
+    tree, origin = build_kd(torch.zeros(0, 3), 1), torch.zeros(1, 3)
+    for axis in range(3):
+        for at in (-0.2, 0.2):
+            tree = tree.split(int(tree.assign(origin)), axis, at)
+    core, views = int(tree.assign(origin)), ring_of_views(6, width=24, height=18)
+    options = {"tree": tree, "warmup": 0.0, "passes": 1, "density": DensityConfig(strategy="off")}
+    coordinator = make_coordinator(tmp_path, Gaussians.cat([wall, inside]), views, steps=10_000, **options)
+    photos = Photos(wall, views)
+    while coordinator.state.epoch < 2:
+        train_step(coordinator, photos)
+    assert coordinator.state.health[core].hidden
+    assert coordinator.scene.clocks(core).visits == 1

@@ -17,7 +17,7 @@ from abcd_ns.engine.train.density.control import (
     DensityConfig,
     DensityControl,
 )
-from abcd_ns.engine.train.density.worth import WORTH
+from abcd_ns.engine.train.density.growing import WORTH
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import activated, random_gaussians
 
@@ -118,15 +118,19 @@ def test_every_run_is_refined_about_4_to_150_times_and_20_where_all_views_were_d
     assert len(found) >= 0.7 * min(USUAL_REFINEMENTS, all_views_drawn) - 1
 
 
-@pytest.mark.parametrize(("run", "views"), [(7000, 147), (7000, 300), (30_000, 700)])
-def test_a_block_is_refined_whenever_its_views_were_drawn(run, views):
-    found = refinements(run, views)
-    assert {b - a for a, b in pairwise(found)} == {views}
-
-
-def test_a_number_of_views_between_refinements_may_be_given():
-    assert {b - a for a, b in pairwise(refinements(3000, 20, refine_every=100))} == {100}
-    assert {b - a for a, b in pairwise(refinements(3000, 130, refine_every=100))} == {130}
+@pytest.mark.parametrize(
+    ("run", "views", "given", "expected"),
+    [
+        (7000, 147, 0, 147),
+        (7000, 300, 0, 300),
+        (30_000, 700, 0, 700),
+        (3000, 20, 100, 100),
+        (3000, 130, 100, 130),
+    ],
+)
+def test_a_block_is_refined_whenever_its_views_or_as_many_as_given_were_drawn(run, views, given, expected):
+    found = refinements(run, views, refine_every=given)
+    assert {b - a for a, b in pairwise(found)} == {expected}
 
 
 @pytest.mark.parametrize(("progress", "expected"), [(0.0, False), (0.1, True), (0.49, True), (0.5, False)])

@@ -8,8 +8,8 @@ from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.planner import LOOK_AGAIN
-from abcd_ns.engine.train.run_state import BlockHealth, RunState
-from abcd_ns.engine.train.schedule import VisitPlan, views_per_step
+from abcd_ns.engine.train.run_state import BlockHealth
+from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, listen, stop
@@ -95,13 +95,6 @@ def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):
         assert_close(apart.params[name], value, rtol=1e-3, atol=1e-4)
     for name, value in together.visit.block.growth.items():
         assert_close(apart.visit.block.growth[name], value, rtol=1e-3, atol=1e-3)
-
-
-def test_a_queue_of_before_visits_knew_their_batch_is_read():
-    state = RunState(queue=[VisitPlan(3, 10, 2)]).to_json()
-    assert RunState.from_json(state).queue == [VisitPlan(3, 10, 2)]
-    state |= {"queue": [[3, 10]], "warm": 0.35}
-    assert RunState.from_json(state).queue == [VisitPlan(3, 10)]
 
 
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photos, monkeypatch):

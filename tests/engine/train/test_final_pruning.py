@@ -7,16 +7,14 @@ import torch
 
 from abcd_ns.engine.events import PrunedAtEnd, Pruning
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import final_pruning
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
+from tests.engine.train.test_degrees import STILL
 from tests.reference.scenes import listen, random_gaussians, whole_scene
 
-STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, min_contribution=1e-9)
-"""Nothing grows, and training prunes nobody that fills anything."""
 VIEWS, FAINT = 5, 30
 """Fewer views than a final pruning looks at: it looks at all of them."""
 
@@ -30,8 +28,8 @@ def scene() -> Gaussians:
 
 @pytest.fixture
 def begin(make, photos):
-    given = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "background": "black"}
-    given["target"] = lambda sample: (photos(sample.view.index, sample.crop), None)
+    given = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "target": photos.target}
+    given["background"] = "black"
 
     def begun(name: str = "run", start: Gaussians | None = None, **options):
         return make(name, start=start or scene(), **{**given, **options})
@@ -132,8 +130,10 @@ def test_black_things_are_missed_where_training_has_other_backgrounds(begin, pho
 
 @pytest.mark.parametrize("density", [{"min_contribution": 0.0}, {"strategy": "off"}])
 def test_options_keep_everything(complete, density):
-    coordinator, told = complete(steps=10, density=replace(STILL, **density))
-    assert coordinator.count() == 120
+    start = scene()
+    start.means[-FAINT:, 2] += 50.0  # no view shows these
+    coordinator, told = complete(start=start, blocks=2, steps=30, density=replace(STILL, **density))
+    assert coordinator.scene.parameters() == 120 * 23  # and their harmonics
     assert not [event for event in told if isinstance(event, PrunedAtEnd)]
 
 
@@ -151,22 +151,18 @@ def test_a_complete_run_goes_on_with_those_that_are_left(complete, begin, photos
     assert at_end(again).before - at_end(again).after <= 0.05
 
 
-class KilledError(Exception):
-    """The process ends."""
-
-
 def test_a_run_that_is_killed_in_it_does_it_anew_and_once(begin, photos, monkeypatch):
-    def killed_at(block, *_):
+    prune_block = FinalPruning._prune_block
+
+    def killed(self, block, *of):
         if block == 2:
-            raise KilledError
+            raise KeyboardInterrupt
+        return prune_block(self, block, *of)
 
     coordinator = begin(blocks=4)
     with monkeypatch.context() as patched:
-        prune_block = FinalPruning._prune_block
-        patched.setattr(
-            FinalPruning, "_prune_block", lambda self, *of: killed_at(*of) or prune_block(self, *of)
-        )
-        with pytest.raises(KilledError):
+        patched.setattr(FinalPruning, "_prune_block", killed)
+        with pytest.raises(KeyboardInterrupt):
             train(coordinator, photos)
     coordinator.close()
     for times in (1, 0):

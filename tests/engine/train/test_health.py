@@ -14,10 +14,7 @@ from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_roo
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
-from tests.reference import scenes
-from tests.reference.scenes import STILL, listen, random_gaussians, stop, whole_scene
-
-GROWING = replace(scenes.GROWING, min_contribution=0.0)
+from tests.reference.scenes import STILL, UNPRUNED, listen, random_gaussians, stop, whole_scene
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
@@ -35,7 +32,7 @@ def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
 
 @pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (1e30, 1)])
 def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(make, photos, value, blocks):
-    coordinator = make(blocks=blocks, steps=12, density=GROWING)
+    coordinator = make(blocks=blocks, steps=12, density=UNPRUNED)
     told = listen(coordinator, Repaired)
     spoil_gradients(coordinator, "scales", 2, value)
     train(coordinator, photos)
@@ -71,7 +68,7 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
 
 
 def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos):
-    coordinator = make(blocks=2, steps=200, density=GROWING)
+    coordinator = make(blocks=2, steps=200, density=UNPRUNED)
     attached = listen(coordinator, VisitBegan)
     while not attached or len(coordinator.params["means"]) == attached[-1].gaussians:
         train_step(coordinator, photos)

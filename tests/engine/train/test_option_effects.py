@@ -46,7 +46,7 @@ def learnt(tmp_path_factory, views, photos):
         start = random_gaussians(120, seed=1, size=0.12, sh_degree=sh_degree)
         usual = {"blocks": 2, "steps": 24, "coarse_model": 60, "warmup": 0.3, "coarse": 0.2}
         if "poses" in options:
-            usual["target"] = lambda sample: (sample.reduced(photos(sample.view.index, sample.source)), None)
+            usual["target"] = photos.target
         options = {**usual, "density": DensityConfig(**density), **options}
         coordinator = make_coordinator(tmp_path_factory.mktemp("run"), start, views, **options)
         train(coordinator, photos)

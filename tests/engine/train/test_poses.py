@@ -44,11 +44,7 @@ def photos():
 def make(make, photos, monkeypatch):
     """Makes runs that begin with the truth, under noisy poses, which are refined soon."""
     monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
-
-    def target(sample):
-        return sample.reduced(photos(sample.view.index, sample.source)), None
-
-    options = {"density": STILL, "poses": "SO3xR3", "background": "black", "target": target}
+    options = {"density": STILL, "poses": "SO3xR3", "background": "black", "target": photos.target}
     return partial(make, start=TRUTH, views=shaken(RING), **options)
 
 

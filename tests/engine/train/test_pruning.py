@@ -166,12 +166,6 @@ def test_few_views_ask_for_less():
     assert [density.for_views(n).min_contribution for n in (5, 12, 25, 500)] == [1.6, 3.84, 8.0, 8.0]
 
 
-def test_without_a_price_everything_stays(make, photos):
-    coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, min_contribution=0.0))
-    train(coordinator, photos)
-    assert coordinator.scene.parameters() == 120 * 23  # and their harmonics
-
-
 def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     coordinator = make(blocks=2, density=replace(STILL, min_contribution=1e-9), batch=1)
     batch, before = coordinator.next_batch(), whole_scene(coordinator)

@@ -122,14 +122,8 @@ def test_a_part_of_a_batch_shows_what_the_whole_shows_there(make, room):
         assert torch.equal(picture[small.crop.within(big.crop).slices], part)
 
 
-@pytest.fixture
-def small_pictures(monkeypatch):
-    """Pictures of 48 x 36 px are reduced, too."""
-    monkeypatch.setattr(schedule, "LEAST_SIDE", 9)
-
-
-@pytest.mark.usefixtures("small_pictures")
-def test_a_run_on_reduced_parts_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
+def test_a_run_on_reduced_parts_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, monkeypatch):
+    monkeypatch.setattr(schedule, "LEAST_SIDE", 9)  # pictures of 48 x 36 px are reduced, too
     assert_resumes(make, photos, 6, blocks=4, steps=14, crop_pixels=600, coarse=0.7)
 
 

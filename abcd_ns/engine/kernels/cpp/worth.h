@@ -1,4 +1,4 @@
-// What a picture says of splits: density/worth.py has the formulas, and the same in torch.
+// What a picture says of splits: density/growing.py has the formulas, and the same in torch.
 #pragma once
 #include <cmath>
 

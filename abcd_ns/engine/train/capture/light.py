@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.gaussians.block_state import Packed
 from abcd_ns.engine.transfer import finest, upload
 from abcd_ns.errors import UserError
 

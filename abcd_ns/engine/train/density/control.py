@@ -1,6 +1,6 @@
 """Growing and pruning the active block, on the block's own clock.
 
-What is worth it is split (see `worth`), and what fills little goes (see `pruning`). gsplat's strategies keep
+What is worth it is split (see `growing`), what fills little goes (see `pruning`). gsplat's strategies keep
 a schedule in absolute steps of one global run. Here it is in shares of the run and in the block's own steps.
 """
 
@@ -17,7 +17,15 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.render.projection import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
-from abcd_ns.engine.train.density.growing import chosen, split_gaussians
+from abcd_ns.engine.train.density.growing import (
+    WORTH,
+    Judged,
+    add_picture,
+    chosen,
+    share_seen,
+    split_gaussians,
+    worth,
+)
 from abcd_ns.engine.train.density.pruning import (
     FAINT,
     LAST,
@@ -27,7 +35,6 @@ from abcd_ns.engine.train.density.pruning import (
     have_contributions,
     risen,
 )
-from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, share_seen, worth
 
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""

@@ -18,7 +18,7 @@ from abcd_ns.engine.render.base import Frame, ResidualSums
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.worth import Judged
+from abcd_ns.engine.train.density.growing import Judged
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, Layer, View
 

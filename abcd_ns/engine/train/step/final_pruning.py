@@ -21,8 +21,7 @@ from torch import Tensor
 from abcd_ns.engine.events import PhotosWanted, PrunedAtEnd, Pruning
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.commit import pending_without, with_pending
-from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
-from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.store.scene import BlockScene, ChangedScene, HeldScene
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
@@ -131,11 +130,12 @@ class FinalPruning:
         chosen = evenly(views, min(max(trained // RANKING, FEWEST), MOST_RANKED))
         probe = _Probe()
         pictures = self._whole.pictures(chosen, ChangedScene(scene, probe.with_leaf))
-        drawn = random_signs(run.config.seed)
+        generator = torch.Generator().manual_seed(run.config.seed)
 
         def gradient(view: View, picture: Raster) -> Float[Tensor, "h w 3"]:
             square, counts = self._square(view, picture)
-            signs = upload(drawn(picture.color.shape), run.device).to(picture.color)
+            signs = torch.randint(0, 2, picture.color.shape, generator=generator, dtype=torch.int8) * 2 - 1
+            signs = upload(signs, run.device).to(picture.color)
             return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
 
         for group in pictures.groups(chosen):
@@ -180,9 +180,3 @@ class FinalPruning:
             stays[~state.deferred] = worth > least
             run.persist(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
         return gone
-
-
-def random_signs(seed: int) -> Callable[[Sequence[int]], Tensor]:
-    """Gives signs of any shape, int8, others each time."""
-    generator = torch.Generator().manual_seed(seed)
-    return lambda shape: torch.randint(0, 2, tuple(shape), generator=generator, dtype=torch.int8) * 2 - 1
