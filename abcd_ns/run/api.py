@@ -137,8 +137,9 @@ def _check_points(places: Tensor, colors: Tensor) -> None:
         raise UserError(
             f"Points and colours are {[*places.shape]} and {[*colors.shape]}: both must be [n, 3]."
         )
-    if colors.is_floating_point() and 0 < float(colors.max()) <= 1:
-        raise UserError("Colours of points are 0..1: multiply them by 255.")
+    low, high = map(float, colors.float().aminmax())
+    if not 0 <= low <= high <= 255 or (colors.is_floating_point() and 0 < high <= 1):
+        raise UserError(f"Colours of points are from {low:g} to {high:g}: scale them to 0..255.")
     if not places.isfinite().all(dim=1).any():
         raise UserError("No point is finite: give points in the world space of the views.")
 
