@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -170,6 +171,10 @@ def _check(
     device: torch.device,
     folder: Path,
 ) -> None:
+    try:
+        msgspec.convert(msgspec.to_builtins(options, enc_hook=lambda number: number.item()), RunOptions)
+    except msgspec.ValidationError as error:
+        raise UserError(f"options: {error}.") from None
     options.check_ranges()
     if steps < 1:
         raise UserError(f"steps must be at least 1, not {steps}.")

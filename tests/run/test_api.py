@@ -73,6 +73,14 @@ def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
     ]
 
 
+def unchecked(**fields: object) -> RunOptions:
+    """Options with fields of a run or of its training, which beartype would refuse elsewhere."""
+    options = RunOptions()
+    for name, value in fields.items():
+        setattr(options if hasattr(options, name) else options.training, name, value)
+    return options
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -95,6 +103,9 @@ def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
         ({"points": (torch.full((2, 3), torch.nan), torch.zeros(2, 3))}, "No point is finite"),
         ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
         ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
+        ({"options": unchecked(partition="oct")}, "'oct' - at `[$].partition`"),
+        ({"options": unchecked(blocks=2.5)}, "`int`, got `float` - at `[$].blocks`"),
+        ({"options": unchecked(light="gain")}, "'gain' - at `[$].training.light`"),
         ({"options": RunOptions(blocks=-1)}, "blocks must be 0 or more"),
         ({"options": RunOptions(blocks=65_537)}, "blocks must be 65536 or less"),
         ({"steps": 0}, "at least 1"),
