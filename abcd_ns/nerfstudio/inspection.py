@@ -110,7 +110,7 @@ def _check_place(path: Path, means: Float64[Tensor, "n 3"], found: Inspected) ->
     tree, middle = cKDTree(cloud), np.median(cloud, axis=0)
     as_it_is, moved = (np.median(tree.query(places)[0]) for places in (means, found.to_run.points(means)))
     if as_it_is < moved / 4:
-        raise UserError(f"{path} is in nerfstudio's frame, as ns-export writes it: use `abcd export`.")
+        raise UserError(f"{path} is in nerfstudio's frame: write it by `abcd export`, without --frame.")
     if moved > np.median(np.linalg.norm(cloud - middle, axis=1)):
         raise UserError(f"{path} lies elsewhere than the points: it is of another scene, or frame.")
 

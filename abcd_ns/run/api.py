@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -138,8 +139,9 @@ def _check_points(places: Tensor, colors: Tensor) -> None:
         raise UserError(
             f"Points and colours are {[*places.shape]} and {[*colors.shape]}: both must be [n, 3]."
         )
-    if colors.is_floating_point() and 0 < float(colors.max()) <= 1:
-        raise UserError("Colours of points are 0..1: multiply them by 255.")
+    low, high = map(float, colors.float().aminmax())
+    if not 0 <= low <= high <= 255 or (colors.is_floating_point() and 0 < high <= 1):
+        raise UserError(f"Colours of points are from {low:g} to {high:g}: scale them to 0..255.")
     if not places.isfinite().all(dim=1).any():
         raise UserError("No point is finite: give points in the world space of the views.")
 
@@ -155,7 +157,7 @@ def _check_views(views: Sequence[View], photos: Sequence[Photo]) -> None:
         if photo.dtype != torch.uint8:
             least, most = map(float, photo.float().aminmax())
             low, high = REAL if photo.is_floating_point() else INTEGER
-            if not low <= least <= most <= high:
+            if photo.dtype == torch.bool or not low <= least <= most <= high:
                 right = "give integers 0..255, or real numbers 0..1"
                 raise UserError(f"Photo {index} has values from {least:g} to {most:g}: {right}.")
         turn, side = view.viewmat[:3, :3].double(), max(view.width, view.height)
@@ -167,6 +169,10 @@ def _check_views(views: Sequence[View], photos: Sequence[Photo]) -> None:
 
 
 def _check_run(steps: int, options: RunOptions, device: torch.device, folder: Path) -> None:
+    try:
+        msgspec.convert(msgspec.to_builtins(options, enc_hook=lambda number: number.item()), RunOptions)
+    except msgspec.ValidationError as error:
+        raise UserError(f"options: {error}.") from None
     options.check_ranges()
     if steps < 1:
         raise UserError(f"steps must be at least 1, not {steps}.")

@@ -53,8 +53,7 @@ class RunOptions:
         if self.blocks > MAX_BLOCKS:
             raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {self.blocks}.")
         if self.max_seconds is not None and not 0 < self.max_seconds < math.inf:
-            refused = f"--pipeline.max-seconds must be above 0 and finite, not {self.max_seconds}"
-            raise UserError(f"{refused}; leave it out for no limit.")
+            raise UserError(f"--pipeline.max-seconds must be above 0 and finite, not {self.max_seconds}.")
         self.training.check()
 
 

@@ -76,6 +76,14 @@ def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
     ]
 
 
+def unchecked(**fields: object) -> RunOptions:
+    """Options with fields of a run or of its training, which beartype would refuse elsewhere."""
+    options = RunOptions()
+    for name, value in fields.items():
+        setattr(options if hasattr(options, name) else options.training, name, value)
+    return options
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -84,10 +92,13 @@ def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
         ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
         ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
         ({"photos": [torch.full((36, 48, 3), 200.0)] * 2}, "Photo 0 has values from 200 to 200: give int"),
+        ({"photos": [torch.full((36, 48, 3), True)] * 2}, "Photo 0 has values from 1 to 1: give int"),
         ({"photos": [torch.full((36, 48, 3), -1.0)] * 2}, "from -1 to -1"),
         ({"photos": [torch.full((36, 48, 3), torch.nan)] * 2}, "from nan"),
         ({"photos": [torch.full((36, 48, 3), 9_999, dtype=torch.uint16)] * 2}, "from 9999"),
-        ({"points": (torch.rand(9, 3), torch.rand(9, 3))}, "multiply them by 255"),
+        ({"points": (torch.rand(9, 3), torch.rand(9, 3))}, "scale them to 0..255"),
+        ({"points": (torch.rand(9, 3), torch.full((9, 3), 65_535))}, "from 65535 to 65535"),
+        ({"points": (torch.rand(9, 3), torch.full((9, 3), torch.nan))}, "from nan"),
         ({"points": (torch.rand(3, 9), torch.zeros(3, 9))}, re.escape("[3, 9] and [3, 9]")),
         ({"views": changed(K=lambda K: K * 0)}, "K must be in pixels"),
         ({"views": changed(K=lambda K: K / 480)}, "K must be in pixels"),
@@ -96,6 +107,9 @@ def changed(**fields: Callable[[torch.Tensor], torch.Tensor]) -> list[View]:
         ({"points": (torch.full((2, 3), torch.nan), torch.zeros(2, 3))}, "No point is finite"),
         ({"points": (torch.zeros(0, 3), torch.zeros(0, 3))}, "0 points and 0 colours"),
         ({"points": (torch.rand(9, 3), torch.zeros(8, 3))}, "9 points and 8 colours"),
+        ({"options": unchecked(partition="oct")}, "'oct' - at `[$].partition`"),
+        ({"options": unchecked(blocks=2.5)}, "`int`, got `float` - at `[$].blocks`"),
+        ({"options": unchecked(light="gain")}, "'gain' - at `[$].training.light`"),
         ({"options": RunOptions(blocks=-1)}, "blocks must be 0 or more"),
         ({"options": RunOptions(blocks=65_537)}, "blocks must be 65536 or less"),
         ({"steps": 0}, "at least 1"),

@@ -125,7 +125,7 @@ def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any], **words
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
     wanted = {"viewmats": (viewmats, 4, 4), "Ks": (Ks, 3, 3)}
-    wanted |= {} if backgrounds is None else {"backgrounds": (backgrounds, backgrounds.shape[-1])}
+    wanted |= {} if backgrounds is None else {"backgrounds": (backgrounds, 3)}
     for name, (value, *size) in wanted.items():
         if list(value.shape) != [len(viewmats), *size]:
             raise ValueError(f"{name} must be {[len(viewmats), *size]}, not {list(value.shape)}.")

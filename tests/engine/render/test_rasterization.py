@@ -163,6 +163,7 @@ assert "colors are torch.float16 on cpu" in says(colors=torch.ones(3, 3).half())
 assert "viewmats must be [4, 4, 4], not [4, 4]" in says(viewmats=torch.eye(4))
 assert "Ks must be [1, 3, 3], not [3, 3]" in says(Ks=torch.eye(3))
 assert "backgrounds must be [1, 3], not [3]" in says(backgrounds=torch.ones(3))
+assert "backgrounds must be [1, 3], not [1, 1]" in says(backgrounds=torch.ones(1, 1))
 assert "render_mode must be one of RGB, D" in says(render_mode="depth")
 assert "rasterize_mode must be one of classic, antialiased, not aa" in says(rasterize_mode="aa")
 """
