@@ -19,6 +19,7 @@ PAPER = TrainingConfig(
         migrate=False,
         pixel_loss="l2",
         fast_start=False,
+        dropout=0.0,
         visit_views=10**6,
         limit_scales=False,
         means_lr_decay=ALONE,

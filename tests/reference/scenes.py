@@ -157,7 +157,7 @@ def activated(gaussians: Gaussians) -> tuple[Params, Optimizers]:
 def training_config(**options) -> TrainingConfig:
     """Options of TrainingConfig, and of its recipe and limits, each by its own name; visits are short, and
     steps no larger than 3DGS's: a few dozen of them leave a scene near what it was."""
-    options = {"passes": 4, "fast_start": False, **options}
+    options = {"passes": 4, "fast_start": False, "dropout": 0.0, **options}
     parts = {}
     for name, kind in (("recipe", Recipe), ("limits", Limits)):
         fields = {field.name for field in dataclasses.fields(kind)} & set(options)

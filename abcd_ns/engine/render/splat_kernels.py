@@ -19,8 +19,8 @@ TINY = 1e-24
 """Squared lengths are clamped to this before dividing by their root."""
 GSPLAT_TILE = 16
 """gsplat's tile size in pixels; decides which pixels a Gaussian may touch."""
-MIN_ALPHA = 1.0 / 255.0
-"""Fragments with less alpha are not drawn."""
+MIN_ALPHA, MAX_ALPHA = 1.0 / 255.0, 0.999
+"""Fragments with less alpha than the first are not drawn, none with more than the second."""
 REACH_MARGIN = 0.01
 """Added to the squared Mahalanobis radius of the bounds, so that rounding never loses a fragment."""
 

@@ -30,6 +30,7 @@ from abcd_ns.engine.train.step.batch import (
     Sample,
     part_to_draw,
 )
+from abcd_ns.engine.train.step.dropout import dropout_at, thinned
 from abcd_ns.engine.train.step.layer_source import LayerRoom, layers_of_visit
 
 
@@ -202,6 +203,10 @@ class VisitTraining:
 
     def _draw(self, samples: Sequence[Sample]) -> Rendered:
         run, gaussians = self.run, active_gaussians(self.run.params)
+        if run.active.is_all:
+            uses = self.block.clocks.adam_views / len(run.views)
+            rate = dropout_at(run.share, len(run.views), uses, run.config.recipe.dropout)
+            gaussians = thinned(gaussians, rate, f"dropout {run.config.seed} {run.state.step}")
         rasters = run.rasterizer.draw(
             gaussians,
             [sample.shot for sample in samples],

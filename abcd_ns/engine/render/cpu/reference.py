@@ -17,13 +17,11 @@ from abcd_ns.engine.render import splat_kernels as kernels
 from abcd_ns.engine.render.base import SUMS, ResidualSums, about, moments
 from abcd_ns.engine.render.cpu.native import Part, Pictures, Windows
 from abcd_ns.engine.render.projection import Primitive
-from abcd_ns.engine.render.splat_kernels import DEPTH, GSPLAT_TILE, MIN_ALPHA, REACH_MARGIN, X, Y
+from abcd_ns.engine.render.splat_kernels import DEPTH, GSPLAT_TILE, MAX_ALPHA, MIN_ALPHA, REACH_MARGIN, X, Y
 from abcd_ns.engine.render.z_window import TileGrid, ends_of, showing
 from abcd_ns.engine.transfer import finest
 from abcd_ns.engine.types import Crop
 
-MAX_ALPHA = 0.999
-"""Alphas are clamped to this."""
 MIN_TRANSMITTANCE = 1e-4
 """The fragment after which T would be at most this, and all behind it, are not drawn."""
 
