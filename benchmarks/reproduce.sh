@@ -13,7 +13,7 @@ small="castle-P30 fox caliterra bonsai"
 two_seeds="--seeds 0 1"
 
 rows() { # by the name, minutes, scene, reduction, then options of `abcd compare`
-    local row=$1 scene
+    local row=$1 scene photos
     for scene in $small; do
         $row splatfacto/$scene 25 $scene 4 --steps 4000 --methods abcd-monolithic splatfacto-scaled $two_seeds
     done
@@ -31,8 +31,10 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
     $row equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
     $row blocks/castle-P30 12 castle-P30 4 --seconds 180 --methods abcd --blocks 1 8 32
     for scene in castle-P30 caliterra fox; do
-        $row few/$scene 5 $scene-12 4 --steps 1500 --methods abcd --blocks 1 8 $two_seeds \
-            --vary training.density.min-contribution=16.667
+        for photos in 12 3; do
+            $row few/$scene-$photos 3 $scene-$photos 4 --steps 1500 --methods abcd-monolithic --seeds 0 1 2 \
+                --vary training.recipe.dropout=0
+        done
     done
     $row coverage/land 12 land 1 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
     $row coverage/caliterra 18 caliterra 4 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
@@ -45,14 +47,14 @@ list() {
     printf '%-26s %3d min   abcd compare --data %s --downscale %s %s\n' "$1" "$2" "$3" "$4" "${*:5}"
 }
 
-with_12_photos() { # of those that are not held out, evenly spaced
-    local from=$DATA/${1%-12} to=$out/data/$1
+with_few_photos() { # of those that are not held out, evenly spaced: as many as the name ends with
+    local from=$DATA/${1%-*} to=$out/data/$1
     mkdir -p "$to"
     ln -sfn "$(realpath "$from/images")" "$to/images"
     ln -sfn "$(realpath "$from/sparse")" "$to/sparse"
     LC_ALL=C ls "$from/images" | awk 'NR % 8 == 1' > "$to/test_list.txt"
-    LC_ALL=C ls "$from/images" | awk 'NR % 8 != 1 {name[n++] = $0}
-        END {for (i = 0; i < 12; i++) print name[int((i + 0.5) * n / 12)]}' > "$to/train_list.txt"
+    LC_ALL=C ls "$from/images" | awk -v few="${1##*-}" 'NR % 8 != 1 {name[n++] = $0}
+        END {for (i = 0; i < few; i++) print name[int((i + 0.5) * n / few)]}' > "$to/train_list.txt"
     echo "$to"
 }
 
@@ -61,7 +63,7 @@ take() {
     [[ ! -f docs/results/$name.jpg ]] || pictures=1
     for wanted in $asked; do
         [[ $wanted == all || $name == "$wanted" || $name == "$wanted"/* ]] || continue
-        [[ $3 != *-12 ]] || data=$(with_12_photos "$3")
+        [[ ! $3 =~ -(12|3)$ ]] || data=$(with_few_photos "$3")
         abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures $pictures --out "$out/$name"
     done
 }
