@@ -6,7 +6,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import torch
 import viser
@@ -60,7 +59,6 @@ class AbcdPanel(ViewerControl):
         self._laid_out = 0  # blocks that have boxes and entries in the list
         self._bounds: Box | None = None
         self._training_views: list[View] = []
-        self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: Viewer) -> None:
@@ -76,7 +74,6 @@ class AbcdPanel(ViewerControl):
         trains = viewer.trainer is not None
         self._controls = Controls(server.gui, viewer.stats_markdown.order + 0.5, self._choose, trains)
         self._scenery = Scenery(server.scene, viewer.config.camera_frustum_scale)
-        server.on_client_connect(self._welcome)
         if not trains:
             self._lay_out()
             self._update()
@@ -124,6 +121,8 @@ class AbcdPanel(ViewerControl):
         self._training_views = self._views()
         self._first_look = first_look(self._bounds, self._training_views)
         self._controls.set_blocks(tree.num_blocks)
+        if not self._laid_out:  # calls it for browsers that are there already, too
+            self.viewer.viser_server.on_client_connect(self._welcome)
         self._laid_out = tree.num_blocks
 
     def _update(self) -> None:
@@ -202,8 +201,7 @@ class AbcdPanel(ViewerControl):
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Place a new browser's camera so that it sees the scene."""
-        if self._first_look is not None:
-            client.camera.position, client.camera.look_at = self._first_look
+        client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
 
     # -- what the user chooses

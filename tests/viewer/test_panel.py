@@ -2,10 +2,16 @@
 
 import threading
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
+import torch
 
 from abcd_ns.engine.events import LayersDrawn, Pruning, StepTaken
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.viewer import panel as panel_module
 from abcd_ns.viewer.panel import AbcdPanel
 
@@ -52,3 +58,14 @@ def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
     monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
     monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", seconds)
     assert draws_meanwhile(watched_panel(browsers), event) == draws
+
+
+def test_a_browser_that_was_open_before_the_panel_is_shown_the_scene_too():
+    """As a page left open is, which connects as soon as the server listens."""
+    client, viewer, points = MagicMock(), MagicMock(trainer=None, train_lock=None), torch.rand(50, 3)
+    viewer.stats_markdown.order = 0.0
+    viewer.viser_server.on_client_connect = lambda welcome: welcome(client)
+    tree = build_kd(points, 2)
+    scene = MemoryScene(tree, cloud_from_points(points, 255 * points, sh_degree=0).gaussians())
+    AbcdPanel(MagicMock(tree=tree, scene=lambda: scene), list, lambda _: None)._setup(viewer)
+    assert isinstance(client.camera.look_at, np.ndarray)
