@@ -21,6 +21,7 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
+from abcd_ns.terminal import many
 from abcd_ns.viewer import texts
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
@@ -141,9 +142,10 @@ class AbcdPanel(ViewerControl):
     def _report(self, coordinator: Trainer) -> None:
         state, left = coordinator.state, texts.clock(texts.time_left(coordinator))
         headline = f"**{self._where(state)}**  \n{coordinator.progress:.0%} of the run, {left} left"
-        epoch = f"Epoch {state.epoch}: {len(state.queue)} visits are waiting" if state.queue else ""
+        waiting = many(len(state.queue), "visit is", "visits are")
+        epoch = f"Epoch {state.epoch}: {waiting} waiting" if state.queue else ""
         if coordinator.finished and not self._stage:
-            headline = "**Trained.**"
+            headline, epoch = "**Trained.**", ""
             if not self._over:
                 self._over, self._controls.boxes.value = True, False  # they were about the training
         self._controls.write(headline=headline, epoch=epoch)

@@ -69,3 +69,18 @@ def test_a_browser_that_was_open_before_the_panel_is_shown_the_scene_too():
     scene = MemoryScene(tree, cloud_from_points(points, 255 * points, sh_degree=0).gaussians())
     AbcdPanel(MagicMock(tree=tree, scene=lambda: scene), list, lambda _: None)._setup(viewer)
     assert isinstance(client.camera.look_at, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    ("finished", "waiting", "said"),
+    [(True, 2, ""), (False, 2, "Epoch 0: 2 visits are waiting"), (False, 1, "Epoch 0: 1 visit is waiting")],
+)
+def test_visits_wait_until_the_run_ends(monkeypatch, finished, waiting, said):
+    """One that ends by its time may end within an epoch."""
+    monkeypatch.setattr(panel_module, "curve_image", lambda *_: "")
+    panel = watched_panel()
+    panel.viewer.update_step = panel._where = lambda _: None
+    panel._controls, panel._log = MagicMock(), MagicMock()
+    state = SimpleNamespace(step=0, epoch=0, queue=[None] * waiting)
+    panel._report(SimpleNamespace(state=state, progress=0.5, finished=finished, config=MagicMock(), views=()))
+    assert panel._controls.write.call_args_list[0].kwargs["epoch"] == said
