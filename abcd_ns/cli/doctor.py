@@ -126,7 +126,7 @@ def _rows(f: Facts) -> dict[str, str]:
         "abcd_ns": f.abcd_ns,
         "packages": ", ".join(f"{name} {f.versions.get(name) or 'not installed'}" for name in MAIN),
         "GPU": f.gpu or "none: training runs on the CPU, which is meant for small pictures",
-        "CPU": f"{f.cpu}, {f.cores} cores" if f.cpu else "unknown, as torch does not start",
+        "CPU": f"{f.cpu}, {many(f.cores, 'core', 'cores')}" if f.cpu else "unknown, as torch does not start",
         "RAM": f"{bytes_in_words(f.ram_bytes)}, {bytes_in_words(f.ram_free_bytes)} free",
         "disk": f"{bytes_in_words(f.disk_free_bytes)} free",
         "workers": _workers(f),

@@ -194,7 +194,7 @@ def find_poses(task: Task, console: Console) -> Path | None:
                 bars.update(poses, completed=posed.value)
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
-        raise UserError(f"pycolmap could not find poses: {first_line(error)}.") from error
+        raise UserError(f"pycolmap could not find poses: {first_line(error).rstrip('.')}.") from error
     finally:
         for process in multiprocessing.active_children():
             process.kill()
@@ -262,7 +262,7 @@ def _map(task: Task, out: Path) -> dict[int, pycolmap.Reconstruction]:
         _posed.value += 1
 
     out.mkdir()
-    _posed.value = 0
+    _posed.value = 2  # a model begins with a pair, for which nothing is called
     options = pycolmap.IncrementalPipelineOptions(random_seed=task.seed, min_model_size=3)
     options.mapper.random_seed = task.seed
     places = task.database, task.photos, out

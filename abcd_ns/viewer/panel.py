@@ -6,7 +6,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import torch
 import viser
@@ -22,6 +21,7 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
+from abcd_ns.terminal import many
 from abcd_ns.viewer import texts
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
@@ -60,7 +60,6 @@ class AbcdPanel(ViewerControl):
         self._laid_out = 0  # blocks that have boxes and entries in the list
         self._bounds: Box | None = None
         self._training_views: list[View] = []
-        self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: Viewer) -> None:
@@ -76,7 +75,6 @@ class AbcdPanel(ViewerControl):
         trains = viewer.trainer is not None
         self._controls = Controls(server.gui, viewer.stats_markdown.order + 0.5, self._choose, trains)
         self._scenery = Scenery(server.scene, viewer.config.camera_frustum_scale)
-        server.on_client_connect(self._welcome)
         if not trains:
             self._lay_out()
             self._update()
@@ -124,6 +122,8 @@ class AbcdPanel(ViewerControl):
         self._training_views = self._views()
         self._first_look = first_look(self._bounds, self._training_views)
         self._controls.set_blocks(tree.num_blocks)
+        if not self._laid_out:  # calls it for browsers that are there already, too
+            self.viewer.viser_server.on_client_connect(self._welcome)
         self._laid_out = tree.num_blocks
 
     def _update(self) -> None:
@@ -142,9 +142,10 @@ class AbcdPanel(ViewerControl):
     def _report(self, coordinator: Trainer) -> None:
         state, left = coordinator.state, texts.clock(texts.time_left(coordinator))
         headline = f"**{self._where(state)}**  \n{coordinator.progress:.0%} of the run, {left} left"
-        epoch = f"Epoch {state.epoch}: {len(state.queue)} visits are waiting" if state.queue else ""
+        waiting = many(len(state.queue), "visit is", "visits are")
+        epoch = f"Epoch {state.epoch}: {waiting} waiting" if state.queue else ""
         if coordinator.finished and not self._stage:
-            headline = "**Trained.**"
+            headline, epoch = "**Trained.**", ""
             if not self._over:
                 self._over, self._controls.boxes.value = True, False  # they were about the training
         self._controls.write(headline=headline, epoch=epoch)
@@ -202,8 +203,7 @@ class AbcdPanel(ViewerControl):
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Place a new browser's camera so that it sees the scene."""
-        if self._first_look is not None:
-            client.camera.position, client.camera.look_at = self._first_look
+        client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
 
     # -- what the user chooses

@@ -60,6 +60,7 @@ def with_tools(tools: dict, **changes) -> Facts:
         (but(ray=None), "up to 2, one for each GPU: ns-train's --pipeline.workers, after pip install"),
         (but(gpus=1), "none here: one GPU"),
         (NO_GPU, "up to 8, one for each core"),
+        (replace(NO_GPU, cores=1), "none here: one core"),
         (with_version(gsplat="1.4.0+pt24cu124"), "up to 2"),  # a version for one CUDA is that version
     ],
 )
@@ -68,6 +69,7 @@ def test_a_healthy_machine_has_no_warnings_and_so_many_workers(capsys, monkeypat
     assert doctor() == 0
     shown = capsys.readouterr().out
     assert f"\nworkers         {workers}" in shown
+    assert ("a CPU, 1 core\n" in shown) == (found.cores == 1)
     assert {finding.name for finding in diagnose(found)} <= {"no-gpu"}
 
 

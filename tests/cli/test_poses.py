@@ -1,6 +1,8 @@
 """`abcd poses`: photos alone become a data set, and what cannot is said."""
 
 import os
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +59,9 @@ def found(places, tmp_path_factory) -> Path:
     textures = np.clip(128 + 150 * smooth, 0, 255)
     for name, place in places.items():
         corner_of_a_room(place, textures).save(data / "images" / name)
-    assert poses.poses(data) == 0
+    with redirect_stdout(StringIO()) as said:
+        assert poses.poses(data) == 0
+    assert said.getvalue().count("100%") == 3  # all bars
     return data
 
 
@@ -148,5 +152,5 @@ def test_photos_of_two_sizes_have_two_lenses_and_others_are_told(blank, monkeypa
 
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
     task = poses.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
-    with pytest.raises(UserError):
+    with pytest.raises(UserError, match=r"[^.]\.$"):
         poses.find_poses(task, Console(quiet=True))

@@ -2,10 +2,16 @@
 
 import threading
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
+import torch
 
 from abcd_ns.engine.events import LayersDrawn, Pruning, StepTaken
+from abcd_ns.engine.gaussians.initialize import cloud_from_points
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.viewer import panel as panel_module
 from abcd_ns.viewer.panel import AbcdPanel
 
@@ -52,3 +58,29 @@ def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
     monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
     monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", seconds)
     assert draws_meanwhile(watched_panel(browsers), event) == draws
+
+
+def test_a_browser_that_was_open_before_the_panel_is_shown_the_scene_too():
+    """As a page left open is, which connects as soon as the server listens."""
+    client, viewer, points = MagicMock(), MagicMock(trainer=None, train_lock=None), torch.rand(50, 3)
+    viewer.stats_markdown.order = 0.0
+    viewer.viser_server.on_client_connect = lambda welcome: welcome(client)
+    tree = build_kd(points, 2)
+    scene = MemoryScene(tree, cloud_from_points(points, 255 * points, sh_degree=0).gaussians())
+    AbcdPanel(MagicMock(tree=tree, scene=lambda: scene), list, lambda _: None)._setup(viewer)
+    assert isinstance(client.camera.look_at, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    ("finished", "waiting", "said"),
+    [(True, 2, ""), (False, 2, "Epoch 0: 2 visits are waiting"), (False, 1, "Epoch 0: 1 visit is waiting")],
+)
+def test_visits_wait_until_the_run_ends(monkeypatch, finished, waiting, said):
+    """One that ends by its time may end within an epoch."""
+    monkeypatch.setattr(panel_module, "curve_image", lambda *_: "")
+    panel = watched_panel()
+    panel.viewer.update_step = panel._where = lambda _: None
+    panel._controls, panel._log = MagicMock(), MagicMock()
+    state = SimpleNamespace(step=0, epoch=0, queue=[None] * waiting)
+    panel._report(SimpleNamespace(state=state, progress=0.5, finished=finished, config=MagicMock(), views=()))
+    assert panel._controls.write.call_args_list[0].kwargs["epoch"] == said

@@ -139,8 +139,8 @@ def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
         mean, most = sum(held_out.fog) / len(held_out.fog), max(held_out.fog)
         found["fog"] = f"{mean:.1%} of the screen, {most:.1%} at most: Gaussians before the nearest point"
     if story.visits and story.blocks > 1:
-        passes = len(story.of(log_lines.EpochEndLine))
-        found["visits"] = f"{len(story.visits)}, {passes} passes over all blocks"
+        passes = many(len(story.of(log_lines.EpochEndLine)), "pass", "passes")
+        found["visits"] = f"{len(story.visits):,}, {passes} over all blocks"
     if (pruned := story.last(log_lines.PrunedAtEndLine)) is not None:
         cost, views = pruned.before - pruned.after, many(pruned.views, "training view", "training views")
         share = pruned.gone / max(pruned.gone + pruned.gaussians, 1)

@@ -127,6 +127,7 @@ def test_figures_of_workers_and_of_the_final_pruning_are_told_where_there_are_an
     found = with_log(run, [*log_lines(), *lines, line("pruned at end", 40, 17.0, **pruned)])
     assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
     figures = more_figures(found, None)
+    assert figures["visits"] == "4, 1 pass over all blocks"
     assert figures["workers"] == "2, waited 15% of the time, 1 lost"
     assert figures["pruned at the end"] == "30 (9%), costs 0.04 dB on 5 training views"
     assert not {"workers", "pruned at the end"} & more_figures(run, None).keys()
