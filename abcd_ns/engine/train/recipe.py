@@ -52,7 +52,7 @@ class Recipe:
     `param_swap.rates_of_under_trained`, and fall at the end of the run, see `schedule.final_decay`."""
     dropout: float = 0.2
     """Share of Gaussians that a step leaves out at the end of a run on very few photos; less before, and with
-    more photos. None with 25, nor in a visit to a block among others. See `step.dropout`."""
+    more photos. None with 16, nor in a visit to a block among others. See `step.dropout`."""
     trained_before: int = 0
     """Views that every block counts as trained on when the run begins."""
 

@@ -7,10 +7,10 @@ from abcd_ns.engine.train.step.dropout import dropout_at, thinned
 from tests.reference.scenes import random_gaussians
 
 
-def test_dropout_rises_along_the_run_and_with_uses_and_ends_at_25_photos():
-    assert dropout_at(1.0, 5, 100, 0.2) == dropout_at(1.0, 5, 900, 0.2) == pytest.approx(0.16)
-    assert dropout_at(0.5, 5, 50, 0.2) == pytest.approx(0.04)
-    assert [dropout_at(share, views, 100, 0.2) for share, views in ((1, 25), (1, 300), (0, 3))] == [0, 0, 0]
+def test_dropout_rises_along_the_run_and_with_uses_and_ends_at_16_photos():
+    assert dropout_at(1.0, 4, 100, 0.2) == dropout_at(1.0, 4, 900, 0.2) == pytest.approx(0.15)
+    assert dropout_at(0.5, 4, 50, 0.2) == pytest.approx(0.0375)
+    assert [dropout_at(share, views, 100, 0.2) for share, views in ((1, 16), (1, 300), (0, 3))] == [0, 0, 0]
 
 
 def test_the_share_is_left_out_anew_in_each_step_and_the_mean_opacity_stays():

@@ -12,11 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.render.splat_kernels import MAX_ALPHA
-from abcd_ns.engine.train.density.control import MANY_VIEWS
 from abcd_ns.engine.types import Gaussians
 
-MANY_USES = 100
-"""Of each view; with fewer, less is left out."""
+MANY_VIEWS, MANY_USES = 16, 100
+"""With so many views nothing is left out; with fewer uses of each, less."""
 MASK = 2**32 - 1
 LEFT_OUT = -20.0
 """Logit of the opacity of what is left out; far below MIN_ALPHA."""
