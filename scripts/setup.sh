@@ -110,7 +110,7 @@ check_open3d() {
 # The CPU rasterizer, for this processor; without a compiler it stays slow and says so itself.
 compile_library() {
   say "compiling the CPU rasterizer: some 15 seconds, once per machine"
-  "$VENV_PYTHON" -c 'from abcd_ns.engine.kernels import library; library()'
+  "$VENV_PYTHON" -c 'from abcd_ns.engine.kernels.native import library; library()'
 }
 
 [[ $(uname -sm) == "Linux x86_64" ]] ||
