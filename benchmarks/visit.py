@@ -31,7 +31,7 @@ from abcd_ns.run.options import RunOptions
 from benchmarks.runs import StageClock, print_machine, read_stage
 
 STAGES = ("plan and attach", "layers", "photos", "render", "loss")
-STAGES += ("backward", "optimizers", "density and settling", "commit")
+STAGES += ("backward", "optimizers", "density and end of visit", "commit")
 
 
 @dataclass
@@ -99,7 +99,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int
     with clock.stage("optimizers"):
         for optimizer in coordinator.optimizers.values():
             optimizer.step()
-    with clock.stage("density and settling"):
+    with clock.stage("density and end of visit"):
         coordinator.after_step(rendered, squared_errors(rendered.pictures, photos))
     return len(batch.samples)
 

@@ -72,7 +72,7 @@ class Disk:
 
 
 def on_disk(scene: StoredScene) -> dict:
-    """The run's state, as whoever opens the store finds it."""
+    """The run's state, as the store has it when it is opened."""
     return ParameterStore.open(scene.store.folder, read_only=True).state
 
 

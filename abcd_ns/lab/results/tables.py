@@ -16,7 +16,7 @@ from rich.table import Table
 from abcd_ns.lab.job import AS_IT_IS, HELD_OUT_EVERY
 from abcd_ns.lab.results.results import TERRAIN, Arm, Outcome, Results, Run
 from abcd_ns.machine import Machine
-from abcd_ns.terminal import print_plain
+from abcd_ns.terminal import many, print_plain
 from abcd_ns.units import GIB, MIB
 
 TABLE_FILE = "table.md"
@@ -212,7 +212,8 @@ def _protocol(results: Results) -> str:
 def about_machine(machine: Machine) -> str:
     """One sentence about what the runs ran on."""
     return (
-        f"{machine.cpu}, {machine.cores} cores, {machine.torch_threads} torch threads, "
+        f"{machine.cpu}, {many(machine.cores, 'core', 'cores')}, "
+        f"{many(machine.torch_threads, 'torch thread', 'torch threads')}, "
         f"{machine.ram_bytes / GIB:.0f} GiB RAM, {machine.gpu or 'no GPU'}, {machine.os}."
     )
 

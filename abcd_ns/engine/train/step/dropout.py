@@ -14,9 +14,10 @@ from torch import Tensor
 from abcd_ns.engine.render.splat_kernels import MAX_ALPHA
 from abcd_ns.engine.types import Gaussians
 
-MANY_VIEWS, MANY_USES = 16, 100
-"""With so many views nothing is left out; with fewer uses of each, less."""
+ENOUGH_VIEWS, USED_OFTEN = 16, 100
+"""With so many views nothing is left out; until each was used so often, less."""
 MASK = 2**32 - 1
+"""The low 32 bits of an integer."""
 LEFT_OUT = -20.0
 """Logit of the opacity of what is left out; far below MIN_ALPHA."""
 
@@ -27,7 +28,7 @@ def dropout_at(share: float, views: int, uses: float, most: float) -> float:
     Args:
         most: what it nears at the end of a run, as the views become few.
     """
-    return most * share * max(1 - views / MANY_VIEWS, 0.0) * min(uses / MANY_USES, 1.0)
+    return most * share * max(1 - views / ENOUGH_VIEWS, 0.0) * min(uses / USED_OFTEN, 1.0)
 
 
 def thinned(gaussians: Gaussians, rate: float, seed: str) -> Gaussians:
