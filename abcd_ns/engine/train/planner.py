@@ -88,6 +88,8 @@ class Planner(Visits):
         while True:
             plan = self._next_plan(at_once)
             views = self._may_see(plan.block)
+            if self._scene.tree.num_blocks == 1:
+                return self._sole_visit(plan.block, views)
             # Where nothing is known, or what shows the block has changed, all views are asked.
             for ask in (self._known_to_show, self._sampled, self._seeing):
                 if (active := self._visit(plan, views, ask(plan.block, views))) is not None:
@@ -102,8 +104,6 @@ class Planner(Visits):
         state.views[block] = len(showing)
         if not showing:
             return None
-        if self._scene.tree.num_blocks == 1:
-            return self._sole_visit(block, showing)
         used, earlier = self._views_used(len(showing)), state.health.get(block, BlockHealth()).visits
         # Where no influence is on record, none is compared with it.
         doubtful = tuple(sorted(views.keys() - set(showing))) if block in state.influence else ()
@@ -133,11 +133,13 @@ class Planner(Visits):
             showing=showing,
         )
 
-    def _sole_visit(self, block: int, showing: tuple[int, ...]) -> ActiveVisit:
-        """The visit to a block that is the whole scene: for the rest of the run, on whole views."""
+    def _sole_visit(self, block: int, views: Mapping[int, View]) -> ActiveVisit:
+        """The visit to a block that is the whole scene: for the rest of the run, on whole views, also on
+        those that see next to nothing of it."""
         run, total = self._run, self._run.budget.steps
         steps = UNLIMITED if total is None else total - run.state.step
-        geometry = VisitGeometry(block, {view: run.views[view].full for view in showing})
+        run.state.views[block] = len(views)
+        geometry = VisitGeometry(block, {index: view.full for index, view in views.items()})
         return ActiveVisit(run.state.visit, VisitKind.JOINT, geometry, run.sh_degree, steps, geometry.views)
 
     def _next_plan(self, at_once: int) -> schedule.VisitPlan:

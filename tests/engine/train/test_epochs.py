@@ -1,5 +1,7 @@
 """What an epoch visits and how: ahead, at first, at the end; and the paper's choices, each an option."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -44,6 +46,19 @@ def test_of_many_views_a_sample_of_a_block_tells_which_see_it(make, views, monke
     assert set(some) <= set(all_that_see)
     assert sampled.keys() == exact.keys()
     assert all(0 < sampled[block] <= exact[block] for block in exact)
+
+
+def test_one_block_is_trained_on_all_views_however_little_each_sees(make, views, monkeypatch):
+    monkeypatch.setattr("abcd_ns.engine.train.planner.MANY", 0)
+    monkeypatch.setattr("abcd_ns.engine.train.planner.SAMPLE", 1)
+    narrow = replace(
+        views[0],
+        index=len(views),
+        K=views[0].K * torch.tensor([[30.0, 1.0, 1.0], [1.0, 30.0, 1.0], [1.0, 1.0, 1.0]]),
+    )
+    coordinator = make(blocks=1, views=[*views, narrow])
+    coordinator.next_batch()
+    assert set(coordinator.state.active.views) == set(range(len(views) + 1))
 
 
 def test_photos_of_a_step_and_of_those_to_come_are_wanted(make):
