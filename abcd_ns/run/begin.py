@@ -17,7 +17,6 @@ from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.gaussians.initialize import PointCloud, cloud_from_points, split_off, thin_points
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer, loss
-from abcd_ns.engine.space.distances import mean_share_seen
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -177,11 +176,8 @@ def _new_store(
     if blocks == 0:
         allowed = fit.fit_run(options, device_bytes, capture.pixels, capture.factor, len(cloud), on_cpu)
         workers = options.workers if fit.has_workers(options) else 0
-        seen = mean_share_seen(capture.views, cloud.means) if capture.points else 1.0
-        blocks, limits = fit.blocks_to_begin_with(allowed, workers, seen), allowed.limits
+        blocks, limits = fit.blocks_to_begin_with(allowed, workers), allowed.limits
         say(replace(allowed, blocks=blocks).in_words())
-        if blocks > allowed.blocks and not workers:
-            say(f"A view sees {seen:.0%} of the points: two blocks learn more in as much time than one.")
     if options.partition == "kd":
         tree = build_kd(cloud.means, blocks)
     else:

@@ -29,9 +29,6 @@ PICTURE_SHARE = 0.75
 LEAST_CROP = 250_000  # pixels: smaller parts of a view are mostly border
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one stored."""
-LITTLE = 0.1
-"""Where a view sees less than this share of a scene, two blocks learn more from as much time than one does:
-their steps take several views each, on the crops that show the block."""
 
 
 @dataclass(frozen=True)
@@ -256,15 +253,15 @@ def has_workers(options: RunOptions) -> bool:
     return options.workers > 1 or options.cluster is not None
 
 
-def blocks_to_begin_with(fit: Fit, workers: int, seen: float) -> int:
-    """As few as fit the device, but enough for every worker, of which 0 stands for one process; and two where
-    a view sees only a share `seen` of the points that is LITTLE. A UserError if workers have no room."""
+def blocks_to_begin_with(fit: Fit, workers: int) -> int:
+    """As few as fit the device, but enough for every worker, of which 0 stands for one process. A UserError
+    if workers have no room."""
     if workers and not fit.limits.block_limit:
         raise UserError(
             f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
             "workers need: train without workers, or on smaller photos."
         )
-    return max(fit.blocks, BLOCKS_EACH * workers, 2 if fit.limits.block_limit and seen < LITTLE else 1)
+    return max(fit.blocks, BLOCKS_EACH * workers)
 
 
 def works_at_once(recipe: Recipe) -> bool:

@@ -21,7 +21,6 @@ class RunOptions:
     """How blocks are trained. docs/reference.md has more options, for files and this command line."""
     blocks: int = 0
     """Number of blocks. 0 takes as few as the device's budget allows, and splits those that outgrow it.
-    It takes two at least where a view sees less than a tenth of the points.
     A number forces that many blocks; the memory budget is then not enforced."""
     device_budget_gb: float = 0.0
     """Device memory for training, GiB. 0 takes 90% of a GPU's free memory, or a quarter of the RAM.

@@ -132,17 +132,9 @@ def test_the_screen_says_more_when_asked(capsys):
         assert word in shown
 
 
-def test_a_scene_of_which_views_see_little_is_cut_in_two_if_there_is_room():
-    little = dataclasses.replace(capture(), seen=0.05)
-    found = planned(Wanted(), little)
-    assert (found.fit.blocks, found.batch) == (2, 4)
-    assert planned(Wanted(blocks=1), little).fit.blocks == 1
-    assert blocks_to_begin_with(FULL, 0, 0.05) == 1
-
-
 def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
     with pytest.raises(UserError, match=r"1\.0 GiB of the device have no room for a block among others"):
-        blocks_to_begin_with(FULL, 2, 1.0)
+        blocks_to_begin_with(FULL, 2)
     alone, found = (planned(Wanted(max_gaussians=600, workers=n)) for n in (1, 3))
     assert (alone.fit.blocks, found.fit.blocks) == (1, 6)
     numbers = DeviceNeeds(48 * 36, 4).parameter_bytes

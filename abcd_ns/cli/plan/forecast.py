@@ -17,7 +17,6 @@ from abcd_ns.cli.plan import Wanted
 from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.gaussians.initialize import cloud_from_points, random_points, shuffled, thin_points
 from abcd_ns.engine.render import make_rasterizer
-from abcd_ns.engine.space.distances import mean_share_seen
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, needs_of
@@ -57,8 +56,6 @@ class Capture:
     views: list[View]
     factor: int = 1
     """By which the photos were reduced."""
-    seen: float = 1.0
-    """Share of the points that a view sees; 1 where they are random."""
 
 
 def read(data: Path, downscale: int | None, console: Console) -> Capture:
@@ -77,7 +74,7 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
                 *random_points(options.model.num_random, options.model.random_scale), views, factor
             )
         seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
-        return Capture(*seeds, views, factor, mean_share_seen(views, seeds[0]))
+        return Capture(*seeds, views, factor)
 
 
 @dataclass(frozen=True)
@@ -149,7 +146,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     on_cpu = device.type == "cpu"
     training = replace(training, density=replace(training.density, max_gaussians=wanted.max_gaussians))
     demand = Demand(pixels, len(points), training, factor=capture.factor, on_cpu=on_cpu)
-    fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted, capture.seen)
+    fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted)
     training = replace(training, limits=fit.limits)
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
@@ -179,13 +176,13 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     )
 
 
-def _fit(budget: int, demand: Demand, wanted: Wanted, seen: float) -> Fit:
+def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
     """As training has it: blocks whose number is given are as large as they become."""
     if wanted.blocks:
         return Fit(wanted.blocks, budget, demand.gaussians, demand.training.limits)
     fit = find_fit(budget, demand, downscale="--downscale", memory="--device-budget-gb")
     workers = wanted.workers if wanted.workers > 1 else 0
-    return replace(fit, blocks=blocks_to_begin_with(fit, workers, seen))
+    return replace(fit, blocks=blocks_to_begin_with(fit, workers))
 
 
 def in_words(hours: float) -> str:

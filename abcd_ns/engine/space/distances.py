@@ -52,12 +52,6 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
     ]
 
 
-def mean_share_seen(views: Sequence[View], points: Float[Tensor, "n 3"]) -> float:
-    """Share of the points (world space) that a view sees in the mean, whatever hides them; 0 of none."""
-    points = _some(points)
-    return sum(int(view.depths_of(points)[1].sum()) for view in views) / max(len(views) * len(points), 1)
-
-
 def _some(points: Float[Tensor, "n 3"]) -> Float64[Tensor, "m 3"]:
     """At most MOST_POINTS of them."""
     return points[:: -(-len(points) // MOST_POINTS) or 1].double()

@@ -12,7 +12,7 @@ from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, 
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.projection import SPLATS, Splats, extents_of
 from abcd_ns.engine.render.z_window import TileGrid
-from abcd_ns.engine.space.distances import as_trained, mean_share_seen
+from abcd_ns.engine.space.distances import as_trained
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import EVERYWHERE, Box
@@ -173,18 +173,6 @@ def test_two_sites_far_apart_are_trained_at_rates_of_their_own():
     alone = as_trained(site, points)
     assert max(view.reach for view in both) < 6 * alone[0].reach
     assert [view.near for view in both] == pytest.approx([alone[0].near] * 12, rel=1e-3)
-
-
-def test_the_share_of_the_points_that_views_see_is_their_mean():
-    views, points = ring_of_views(5), 3 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
-    expected = 0
-    for view in views:
-        for x, y, z in (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).tolist():
-            u, v = (view.K[0, 0] * x / z + view.K[0, 2], view.K[1, 1] * y / z + view.K[1, 2])
-            expected += z > view.near and 0 <= u < view.width and 0 <= v < view.height
-    assert 0 < expected < 300
-    assert mean_share_seen(views, points) == pytest.approx(float(expected) / 300)
-    assert mean_share_seen(views, points[:0]) == 0
 
 
 def test_a_view_that_sees_no_point_reaches_as_far_as_the_others():
