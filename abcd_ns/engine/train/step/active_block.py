@@ -159,9 +159,12 @@ class ActiveBlock:
         gone, rest = self.growth.get(GONE), self._run.params["features_rest"]
         if gone is None or rest.grad is None:
             return
-        if self._held is None or self._held[0] is not gone or self._held[1].shape[1] != rest.shape[1]:
-            self._held = gone, are_gone(gone, rest, self._highest)
-        rest.grad.masked_fill_(self._held[1], 0.0)
+        if self._held is None or self._held[0] is not gone:
+            degrees = torch.arange(1, self._highest + 1, device=gone.device)[:, None]
+            self._held = gone, (degrees <= self._highest - gone).to(rest.dtype)[..., None, None]
+        # Degree by degree: a CPU takes eight times as long for a mask of all coefficients.
+        for degree, kept in enumerate(self._held[1], start=1):
+            rest.grad[:, degree**2 - 1 : (degree + 1) ** 2 - 1].mul_(kept)
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """What decides whether to refine, see `after_step`."""
