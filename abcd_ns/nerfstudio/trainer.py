@@ -32,6 +32,7 @@ from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, comma
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.fit import device_budget, fit_run
 from abcd_ns.run.store import Start
+from abcd_ns.terminal import many
 from abcd_ns.viewer.guard import THIS_MACHINE, WILDCARDS
 
 
@@ -267,8 +268,9 @@ class AbcdTrainer(Trainer):
             self.config.max_num_iterations = 0
 
     def _memory_is_full(self) -> str:
-        limit = self.pipeline.coordinator.config.limits.block_limit
-        room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
+        run = self.pipeline.coordinator.run
+        limit = run.limits.of_block(run.blocks)
+        room = f"blocks of {limit:,} Gaussians" if limit else many(run.blocks, "block", "blocks")
         return (
             f"The device's memory does not hold {room}. Nothing that a visit has finished is lost: go on "
             "with --pipeline.blocks 0 and a smaller --pipeline.device-budget-gb, or begin anew with smaller "

@@ -54,10 +54,11 @@ class Fit:
     def in_words(self) -> str:
         """One line for the terminal."""
         blocks = "1 block" if self.blocks == 1 else f"{self.blocks} blocks"
-        limits, most = self.limits, self.limits.of_block(self.blocks)
+        limits, most = self.limits, self.limits.of_block(self.blocks) or self.limits.sole_limit
         grows = "a block that comes near that is cut in two."
         if not limits.block_limit:
-            grows = "there is no room for the layers of more, and the scene stops growing at that."
+            why = "there is no room for the layers of more, and the scene" if self.blocks == 1 else "each"
+            grows = f"{why} stops growing at that."
         budget = f"{bytes_in_words(self.budget)} of the device allow {most:,} Gaussians in a block"
         said = f"{budget}: {blocks} to begin with; {grows}"
         if limits.crop_pixels:

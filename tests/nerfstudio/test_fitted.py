@@ -2,6 +2,8 @@
 
 import torch
 
+from abcd_ns import methods
+from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.step.final_pruning import FinalPruning
@@ -60,3 +62,13 @@ def test_a_run_that_resumes_with_the_budget_it_has_keeps_its_limits(data, tmp_pa
     assert later.pipeline.coordinator.config.limits.sole_limit == limits[1]
     more = begun("with more", 4.0, 15, load_dir=later.base_dir)
     assert more.pipeline.coordinator.config.limits.sole_limit > limits[1]
+
+
+def test_where_memory_is_full_the_blocks_are_named_that_there_are(data, tmp_path, said_at_exit):
+    def full(event: Event) -> None:
+        if isinstance(event, StepTaken):
+            raise torch.cuda.OutOfMemoryError
+
+    config = configure(data, tmp_path, methods.abcd_partition, blocks=0, steps=STEPS)
+    config.pipeline.gaussian_bytes = GIB
+    assert "The device's memory does not hold 2 blocks." in said_at_exit(run, config, listener=full)

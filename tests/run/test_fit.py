@@ -209,6 +209,14 @@ def test_room_for_gaussians_alone_may_be_too_little_too():
     assert fit_run(RunOptions(gaussian_bytes=GIB), 0, PIXELS, 1, POINTS, on_cpu=True).blocks == 1
 
 
+def test_what_isolated_blocks_may_hold_is_said():
+    options = RunOptions(gaussian_bytes=GIB // 8, training=training_config(overlap=0.2, layers=False))
+    fit = fit_run(options, 0, PIXELS, 1, POINTS, on_cpu=True)
+    assert fit.limits.block_limit == 0  # none is cut
+    assert f"allow {fit.limits.sole_limit:,} Gaussians in a block: {fit.blocks} blocks" in fit.in_words()
+    assert "each stops growing" in fit.in_words()
+
+
 @given(st.integers(1, 2**50))
 def test_shares_of_ram_add_up(budget):
     shares = RamShares.of(budget / GIB)
