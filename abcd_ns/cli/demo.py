@@ -120,8 +120,8 @@ def _sum_up(out: Path, run: Path, seconds: float, taken: float, console: Console
     console.print("\n[bold]Done[/]")
     facts = {
         "held-out PSNR": f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}" if scores else "not measured",
-        "Gaussians": f"{end.gaussians:,}",
-        "peak RAM": f"{bytes_in_words(end.peak_rss_bytes)} in training",
+        "Gaussians": f"{story.gaussians:,}",
+        "peak RAM": f"{bytes_in_words(end.peak_rss_bytes)} in training" if end else "not measured",
         "not visited": f"{missed} of {story.blocks} blocks",
         "time": f"{taken:.0f} s, training {story.end.seconds:.0f} s of it",
         "report": str(out / "report.html"),

@@ -27,7 +27,8 @@ def run_instead(command: list[str]) -> None:
         (folder / "abcd").mkdir(parents=True)
         (folder / "config.yml").touch()
         end = line("end", 40, 17.0, gaussians=1234, peak_rss_bytes=3 << 30)
-        write_log(folder / "abcd/log.jsonl", [*log_lines(), end])
+        ended = [] if "DISK_IS_FULL" in os.environ else [end]
+        write_log(folder / "abcd/log.jsonl", [*log_lines(), *ended])
     else:
         run = Path(command[2]) if command[0] == "abcd" else Path(command[3]).parent
         assert (run / "config.yml").exists()
@@ -70,6 +71,13 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(calls, tmp_path, capsys)
     for part in (*figures, str(out / "splat.ply"), str(out / "report.html"), "abcd demo --seconds 10"):
         assert part in printed
     assert (out / "logs" / "ns-export.log").read_text() == "output of ns-export"
+
+
+def test_a_log_that_the_disk_refused_leaves_the_rest_of_the_summary(calls, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DISK_IS_FULL", "")
+    assert demo(out=tmp_path / "demo", seconds=5.0, blocks=3) == 0
+    assert [name for name, *_ in calls] == ["ns-train", "ns-export", "abcd"]
+    assert "peak RAM               not measured" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("broken", "where"), [("ns-train", "its output above"), ("ns-export", "export.log")])
