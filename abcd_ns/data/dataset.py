@@ -27,8 +27,8 @@ PHOTOS = "photos"  # the entry of the metadata that holds one PhotoSource for ea
 
 class AbcdDataset(InputDataset):
     """The photos that a dataparser, ours or any of nerfstudio's, found: at the size of their cameras and
-    without distortion. See `Photos` and `with_photos`; `scale_factor` is 1. With `on_black` transparent
-    photos are put on black as float32: ns-render dataset shows four channels in false colours."""
+    without distortion. See `Photos` and `with_photos`; `scale_factor` is 1. As float32, transparent photos
+    are put on the colour `behind`, if any: ns-render dataset shows four channels in false colours."""
 
     def __init__(
         self,
@@ -36,11 +36,11 @@ class AbcdDataset(InputDataset):
         scale_factor: float = 1.0,
         budget_bytes: int | None = None,
         needs_photos: bool = True,
-        on_black: bool = False,
+        behind: Sequence[float] | None = None,
     ):
         outputs = with_photos(dataparser_outputs, needs_photos)
         super().__init__(outputs, scale_factor)
-        self.photos, self._on_black = Photos(outputs.metadata[PHOTOS], budget_bytes), on_black
+        self.photos, self._behind = Photos(outputs.metadata[PHOTOS], budget_bytes), behind
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """uint8 [H, W, 3 or 4], shared with later callers: do not write to it."""
@@ -48,7 +48,9 @@ class AbcdDataset(InputDataset):
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w c"]:
         image = super().get_image_float32(image_idx)
-        return image[..., :3] * image[..., 3:] if self._on_black and image.shape[-1] == 4 else image
+        if self._behind is None or image.shape[-1] == 3:
+            return image
+        return torch.lerp(image.new_tensor(self._behind), image[..., :3], image[..., 3:])
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """`image_idx`, `image` of the type asked for, [H, W, 3 or 4], and, if any, `mask` bool [H, W, 1]."""

@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -109,6 +109,8 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """RAM for decoded photos, GiB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
     poses: ClassVar[Mapping[int, torch.Tensor]] = MappingProxyType({})
     """Refined poses of a run that was opened; `ns-render dataset` makes more datamanagers of this config."""
+    background: ClassVar[Sequence[float]] = (0.0, 0.0, 0.0)
+    """Likewise what its pictures are drawn on, for photos with alpha."""
 
     def __post_init__(self) -> None:
         if self.data_format is None:
@@ -158,7 +160,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def _dataset(self, outputs: DataparserOutputs, budget: int | None) -> AbcdDataset:
         needs_photos = self.test_mode != "inference"  # viewing and exporting need none
-        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=needs_photos, on_black=True)
+        behind = self.config.background
+        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=needs_photos, behind=behind)
 
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; none is kept in RAM."""

@@ -184,11 +184,13 @@ class AbcdPipeline(VanillaPipeline):
         return wanted
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """As VanillaPipeline's; cameras stand where their poses were refined to."""
+        """As VanillaPipeline's; cameras stand where their poses were refined to, and photos with alpha
+        have the background of pictures."""
         with as_a_command():
             super().load_pipeline(loaded_state, step)
             check_box(sys.argv, self.model.means)
         self.config.datamanager.poses = self.model.poses
+        self.config.datamanager.background = self.model.background_color.tolist()
         self.datamanager.take_poses(self.model.poses)
 
     def _before_evaluation(self) -> None:

@@ -48,14 +48,16 @@ def write_blender(folder: Path, splits: tuple[str, ...] = ("train", "val", "test
 # Photos and masks elsewhere
 
 
-def test_transparent_photos_are_colours_on_black_to_ns_render_and_the_viewer(tmp_path):
+def test_transparent_photos_are_colours_on_a_background_to_ns_render_and_the_viewer(tmp_path):
     """ns-render dataset draws pictures of more than three channels by their principal components."""
     outputs = parser(write_blender(tmp_path)).get_dataparser_outputs()
-    usual, shown = (AbcdDataset(outputs, on_black=on_black) for on_black in (False, True))
+    usual, shown = (AbcdDataset(outputs, behind=behind) for behind in (None, (0.2, 0.4, 0.6)))
     stored = shown.get_data(0, "uint8")["image"].float() / 255
     assert stored.shape == (24, 32, 4)
     assert torch.equal(usual[0]["image"], stored)
-    assert torch.equal(shown[0]["image"], stored[..., :3] * stored[..., 3:])
+    color, alpha = stored[..., :3], stored[..., 3:]
+    expected = alpha * color + (1 - alpha) * torch.tensor([0.2, 0.4, 0.6])
+    assert torch.allclose(shown[0]["image"], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("called", ["{stem}.png", "{name}.png", "{name}"])

@@ -121,6 +121,20 @@ def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
         assert float(psnr(drawn, photo)) > 12
 
 
+def test_transparent_photos_are_written_on_the_background_of_the_pictures(data, trained, tmp_path):
+    scene = shutil.copytree(data, tmp_path / "scene")
+    for photo in (scene / "images").iterdir():
+        picture = Image.open(photo)
+        picture.putalpha(0)
+        picture.save(photo)
+    names, config = ["gt-rgb", "background"], trained.base_dir / "config.yml"
+    options = {"rendered_output_names": names, "image_format": "png", "data": scene}
+    render.DatasetRender(load_config=config, output_path=tmp_path / "out", **options).main()
+    photos, backgrounds = (pictures(tmp_path / "out" / "test" / name) for name in names)
+    assert len(photos) == HELD_OUT
+    assert all((photos[name] == backgrounds[name]).all() for name in backgrounds)
+
+
 # Scores
 
 
