@@ -17,6 +17,8 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
+from abcd_ns.data.dataset import PHOTOS
+from abcd_ns.data.input_errors import say
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, Ownership, RenderSettings, default_pass
@@ -170,14 +172,23 @@ class AbcdModel(SplatfactoModel):
             )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What is no parameter: the tree, the near plane and refined poses."""
-        return {"tree": self.tree.to_json(), "near": self.near, "poses": self.poses}
+        """What is no parameter: the tree, the near plane, refined poses and the names of their photos."""
+        poses = {"poses": self.poses, "photos": self._photos}
+        return {"tree": self.tree.to_json(), "near": self.near, **poses}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over what `get_extra_state` returned."""
         self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
         self._poses = state.get("poses", {})
+        if self._poses and state.get("photos", self._photos) != self._photos:  # old checkpoints have no names
+            say("These are not the photos of the run: its refined poses are not used.", "yellow")
+            self._poses = {}
+
+    @property
+    def _photos(self) -> list[str]:
+        """Names of the training photos; readers differ in the case and ending of some."""
+        return [source.path.stem.casefold() for source in self.kwargs.get("metadata", {}).get(PHOTOS, ())]
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """The crops of a training batch where the camera carries one, else the whole picture."""

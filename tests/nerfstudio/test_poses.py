@@ -66,3 +66,16 @@ def test_ns_render_dataset_draws_from_refined_poses(trained, tmp_path, monkeypat
     manager = eval_setup(config)[1].datamanager
     known = [matrices(dataset.cameras) for dataset in (manager.train_dataset, manager.eval_dataset)]
     assert torch.equal(torch.cat([matrices(camera) for camera in drawn]), torch.cat(known))
+
+
+def test_ns_render_dataset_leaves_photos_of_others_where_they_are(trained, tmp_path, monkeypatch, capsys):
+    trainer, given = trained
+    drawn, view = [], AbcdModel.view
+    monkeypatch.setattr(AbcdModel, "view", lambda self, camera: (drawn.append(camera), view(self, camera))[1])
+    options = {"rendered_output_names": ["rgb"], "image_format": "png", "split": "train"}
+    other = write_scene(tmp_path / "other", prefix="other-")
+    config = trainer.base_dir / "config.yml"
+    DatasetRender(load_config=config, output_path=tmp_path, data=other, **options).main()
+    expected = matrices(given.train_dataset.cameras)
+    assert torch.equal(torch.cat([matrices(camera) for camera in drawn]), expected)
+    assert capsys.readouterr().out.count("its refined poses are not used") == 1

@@ -13,8 +13,8 @@ LEFT, RIGHT = (40, 80, 200), (200, 60, 40)
 FOCAL, DISTANCE = 40.0, 4.0
 
 
-def write_scene(folder: Path) -> Path:
-    """Write photos, poses and 300 points on the wall into `folder`, and return it."""
+def write_scene(folder: Path, prefix: str = "") -> Path:
+    """Write photos, poses and 300 points on the wall into `folder`, and return it. `prefix` begins names."""
     rng = np.random.default_rng(0)
     model = pycolmap.Reconstruction()
     params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
@@ -22,7 +22,7 @@ def write_scene(folder: Path) -> Path:
     model.add_camera_with_trivial_rig(camera)
     (folder / "images").mkdir(parents=True)
     for i in range(VIEWS):
-        name, shift = f"{i:02d}.png", 0.2 * i - 1
+        name, shift = f"{prefix}{i:02d}.png", 0.2 * i - 1
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0.0, DISTANCE]))
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=i + 1), pose)
         x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL * DISTANCE + shift
