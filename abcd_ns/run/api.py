@@ -23,7 +23,7 @@ from abcd_ns.engine.store.manifest import manifest_path
 from abcd_ns.engine.train import training_loop
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample, Target
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, View, centers_of
 from abcd_ns.errors import UserError
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.begin import Capture, begin_run, cloud_of
@@ -34,6 +34,7 @@ LOG = logging.getLogger("abcd_ns")
 Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]  # 0..255 as integers, or 0..1
 REAL, INTEGER = (-0.5, 2.0), (0.0, 255.0)  # values of photos; filters go beyond 0..1
 MOST_STRETCH = 2e-2  # of R R^T from the identity
+LOST_DIGITS = 1e-4  # rounding of positions above this share of a view's reach may show in pictures
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def train(
     _check_views(views, photos)
     _check_points(places, colors)
     views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
-    views = as_trained(views, places, options.near_plane)
+    views = _told(as_trained(views, places, options.near_plane))
 
     def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         pixels = torch.as_tensor(photos[index])[crop.slices]
@@ -166,6 +167,16 @@ def _check_views(views: Sequence[View], photos: Sequence[Photo]) -> None:
             raise UserError(f"View {index} has a viewmat that is no rotation and translation: repair it.")
         if not all(side / 50 < focal < side * 1000 for focal in view.K.diagonal()[:2].tolist()):
             raise UserError(f"View {index} has a focal length that no camera has: K must be in pixels.")
+
+
+def _told(views: list[View]) -> list[View]:
+    """The views; logs it where float32 rounds their positions too much."""
+    farthest = float(centers_of(views).abs().max())
+    off = farthest * torch.finfo(torch.float32).eps
+    if off > LOST_DIGITS * min(view.reach for view in views):
+        far = f"Cameras are {farthest:,.0f} units from the origin, where float32 rounds to {off:.1g}"
+        LOG.warning(f"{far}: the scene may be less sharp. Move views and points near the origin.")
+    return views
 
 
 def _check_run(steps: int, options: RunOptions, device: torch.device, folder: Path) -> None:
