@@ -32,6 +32,7 @@ from abcd_ns.engine.space.visibility import Optics, reaches
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.density.growing import Judged
+from abcd_ns.engine.train.planner import NothingSeenError
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.train.step.batch import (
@@ -77,7 +78,11 @@ class ExactTrainer(Trainer):
         return views_per_step(self.config.batch, 1)
 
     def next_batch(self) -> Batch:
-        """Set the learning rate and say what to train on next: whole views, or random parts."""
+        """Set the learning rate and say what to train on next: whole views, or random parts. A
+        NothingSeenError if no Gaussian is left."""
+        if not len(self._all):
+            low = "--pipeline.training.density.cull-alpha-thresh"
+            raise NothingSeenError(f"no Gaussian is left: set {low} lower, and min-contribution")
         self.stopwatch.start()
         decay = exponential_decay(self.progress, self.config.recipe.means_lr_decay) * self._reach
         self._pace.set(self.batch, self.state.step * self.batch, decay)

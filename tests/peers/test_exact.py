@@ -11,6 +11,7 @@ from abcd_ns.engine.store.special_blocks import ACTIVE
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
 from abcd_ns.peers.exact import ExactTrainer
 from tests.reference.scenes import GROWING, STILL, Photos, random_gaussians, ring_of_views, stop, whole_scene
 
@@ -123,6 +124,11 @@ def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(exa
     assert sum(store.counts(block) for block in range(4)) == coordinator.count() == 150
     for block in range(4):
         assert bool((tree.assign(store.load(block)[0]["means"]) == block).all())
+
+
+def test_a_scene_of_which_nothing_is_left_ends_in_one_line(exact, photos):
+    with pytest.raises(UserError, match=r"no Gaussian is left: set .*cull-alpha-thresh lower"):
+        train(exact(blocks=2, steps=40, density=replace(GROWING, cull_alpha_thresh=1.0)), photos)
 
 
 def test_a_run_that_stops_goes_on(exact, photos):
