@@ -94,8 +94,8 @@ class Run:
     """Of how many numbers the Gaussians are: harmonics count up to the degree that each has. None in results
     of versions that gave all the same degree, and of `abcd compare --tiles`."""
     ply_bytes: int | None = None
-    """Of the scene as a .ply; None in results of versions that did not ask, of more than four million
-    Gaussians, and of `abcd compare --tiles`."""
+    """Of the scene as a .ply, which leaves out Gaussians too transparent to be drawn. None in results of
+    versions that did not ask, of more than four million Gaussians, and of `abcd compare --tiles`."""
     spz_bytes: int | None = None
     """Likewise as an .spz in the run's frame, in which harmonics that are nothing take next to nothing; None
     also where the package is missing that packs it."""
