@@ -34,7 +34,7 @@ LOG = logging.getLogger("abcd_ns")
 Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]  # 0..255 as integers, or 0..1
 REAL, INTEGER = (-0.5, 2.0), (0.0, 255.0)  # values of photos; filters go beyond 0..1
 MOST_STRETCH = 2e-2  # of R R^T from the identity
-LOST_DIGITS = 1e-4  # rounding of positions above this share of a view's reach may show in pictures
+LOST_DIGITS = 1e-3  # rounding of positions above this share of a view's reach may show in pictures
 
 
 @dataclass(frozen=True)

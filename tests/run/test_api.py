@@ -154,16 +154,3 @@ def test_coordinates_that_single_precision_rounds_are_told_of(tmp_path, caplog, 
     points = torch.rand(9, 3).double() - 0.5 + away, torch.zeros(9, 3)
     train(views, [torch.zeros(36, 48, 3)] * 2, points, tmp_path, steps=1)
     assert caplog.text.count("units from the origin, where float32 rounds to") == warnings
-
-
-@pytest.mark.parametrize(("sites", "blocks"), [(2, 1), (20, 2)])
-def test_a_scene_of_which_views_see_little_is_trained_in_two_blocks(tmp_path, sites, blocks):
-    views, points = [], []
-    for site in range(sites):
-        away = torch.tensor([0.0, 20.0 * site, 0.0])  # cameras look along x
-        points.append(torch.rand(40, 3, generator=torch.Generator().manual_seed(site)) - 0.5 + away)
-        views += [moved(view, away) for view in ring_of_views(2)]
-    photos, points = [torch.zeros(36, 48, 3)] * len(views), torch.cat(points)
-    train(views, photos, (points, torch.zeros_like(points)), tmp_path, steps=1)
-    with ParameterStore.open(tmp_path / STATE / STORE, read_only=True) as store:
-        assert BlockTree.from_json(store.header["tree"]).num_blocks == blocks

@@ -1,5 +1,6 @@
 """Which block is trained next, on which views, and for how many steps."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from statistics import median_high
@@ -59,6 +60,8 @@ class Planner(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
+        self._since, self._taken = 0.0, 0
+        self._of_epoch, self._is_last = 0, False
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; most epochs pass over blocks that no
@@ -151,7 +154,27 @@ class Planner(Visits):
         if not free:
             raise BlocksBusyError
         beside = overlaps(state.influence, (state.queue[place].block for place in free), busy)
-        return state.queue.pop(free[beside.index(min(beside))])
+        return self._in_time(state.queue.pop(free[beside.index(min(beside))]))
+
+    def _in_time(self, plan: schedule.VisitPlan) -> schedule.VisitPlan:
+        """The visit; where a limit in seconds leaves less than half an epoch after this one, all that are
+        left of this one become shorter or longer to use it up."""
+        left, waiting = self._views_left(), sum(map(_views_of, (plan, *self._run.state.queue)))
+        self._is_last |= left < waiting + self._of_epoch / 2
+        if self._is_last:
+            plan = plan._replace(steps=max(round(plan.steps * min(left / waiting, 2)), 1))
+        if not self._taken:
+            self._since = self._run.stopwatch.seconds
+        self._taken += _views_of(plan)
+        return plan
+
+    def _views_left(self) -> float:
+        """That visits may draw in the seconds left, at the pace of those since this process began; infinite
+        without a limit, and where no visit tells."""
+        seconds, now = self._run.budget.seconds, self._run.stopwatch.seconds
+        if seconds is None or not self._taken:
+            return math.inf
+        return max(seconds - now, 0.0) * self._taken / (now - self._since)
 
     def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
@@ -180,6 +203,7 @@ class Planner(Visits):
         batches = {block: self._views_of_step(block) for block in used}
         options = passes, remaining, self._config.seed, recipe.visit_steps, batches
         state.queue = list(schedule.plan_epoch(state.epoch, used, *options))
+        self._of_epoch, self._is_last = sum(map(_views_of, state.queue)), False
 
     def _views_of_step(self, block: int) -> int:
         """Fewer while the block is under-trained, where its steps are larger for that."""
@@ -237,6 +261,10 @@ class Planner(Visits):
             return VisitGeometry(block, {})
         gaussians = self._scene.stored_with_pending(block).to(self._run.device)
         return footprints(gaussians, block, views.values(), self._run.rasterizer, share)
+
+
+def _views_of(plan: schedule.VisitPlan) -> int:
+    return plan.steps * plan.batch
 
 
 def _typical(views: Mapping[int, int]) -> int:

@@ -1,5 +1,6 @@
 """What an epoch visits and how: ahead, at first, at the end; and the paper's choices, each an option."""
 
+from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.planner import LOOK_AGAIN
-from abcd_ns.engine.train.run_state import BlockHealth
+from abcd_ns.engine.train.run_state import BlockHealth, Budget, Stopwatch
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -96,6 +97,20 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(mak
             coordinator, stops = make(resume=True, **options), stops + 1
     assert drawn == {1, 2, 4}
     assert stops > 0
+
+
+@pytest.mark.parametrize(("seconds", "epochs"), [(26, 1), (45, 1), (58, 1), (62, 2), (95, 2), (110, 3)])
+def test_blocks_share_what_a_limit_in_seconds_leaves_for_the_last_epoch(make, photos, seconds, epochs):
+    coordinator = make(blocks=4, visit_steps=10, batch=1, warmup=0.0, density=STILL)
+    coordinator.run.budget = Budget(seconds=seconds)
+    coordinator.run.stopwatch = Stopwatch(clock=lambda: float(coordinator.state.step))  # a second each
+    began = listen(coordinator, VisitBegan)
+    train(coordinator, photos)
+    assert coordinator.state.step == seconds
+    assert Counter(visit.block for visit in began) == dict.fromkeys(range(4), epochs)
+    # How long a step takes is known after the first visit.
+    last = [visit.steps for visit in began[1:] if visit.epoch == epochs - 1]
+    assert max(last) - min(last) <= 1
 
 
 def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):
