@@ -13,10 +13,7 @@ import torch
 from abcd_ns import RunOptions, TrainingConfig, UserError, View, train
 from abcd_ns.cli.export import export
 from abcd_ns.engine.events import StepTaken
-from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore
 from abcd_ns.nerfstudio.views import views_of
-from abcd_ns.run import STATE, STORE
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import write_scene
