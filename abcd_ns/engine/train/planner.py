@@ -60,7 +60,7 @@ class Planner(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
-        self._since, self._taken = 0.0, 0
+        self._since, self._taken = math.inf, 0
         self._of_epoch, self._is_last = 0, False
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
@@ -163,8 +163,7 @@ class Planner(Visits):
         self._is_last |= left < waiting + self._of_epoch / 2
         if self._is_last:
             plan = plan._replace(steps=max(round(plan.steps * min(left / waiting, 2)), 1))
-        if not self._taken:
-            self._since = self._run.stopwatch.seconds
+        self._since = min(self._since, self._run.stopwatch.seconds)
         self._taken += _views_of(plan)
         return plan
 
@@ -172,7 +171,7 @@ class Planner(Visits):
         """That visits may draw in the seconds left, at the pace of those since this process began; infinite
         without a limit, and where no visit tells."""
         seconds, now = self._run.budget.seconds, self._run.stopwatch.seconds
-        if seconds is None or not self._taken:
+        if seconds is None or now <= self._since:
             return math.inf
         return max(seconds - now, 0.0) * self._taken / (now - self._since)
 
