@@ -263,7 +263,7 @@ class Planner(Visits):
 
 
 def _views_of(plan: schedule.VisitPlan) -> int:
-    return plan.steps * plan.batch
+    return plan.steps * (plan.batch or 1)
 
 
 def _typical(views: Mapping[int, int]) -> int:
