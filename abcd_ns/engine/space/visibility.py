@@ -133,14 +133,12 @@ class Frusta:
         self._edges = torch.tensor(edges, dtype=torch.float64).reshape(-1, 2, 2)
         self._near = torch.tensor([view.near for view, _ in self.seen], dtype=torch.float64)[:, None]
 
-    def may_show(
-        self, boxes: Float64[Tensor, "n 2 3"], rows: Sequence[int] | slice = slice(None)
-    ) -> Bool[Tensor, "n v"]:
+    def may_show(self, boxes: Float64[Tensor, "n 2 3"]) -> Bool[Tensor, "n v"]:
         """Whether something in each box may be drawn in each crop; False is certain.
 
         A box is out of sight if all its corners are beyond one of the planes.
         """
-        return self._look(boxes, rows)[0]
+        return self._look(boxes)[0]
 
     def crops(
         self, boxes: Float64[Tensor, "n 2 3"], wanted: Bool[Tensor, "n v"]
@@ -166,18 +164,15 @@ class Frusta:
                 found[view.index] = shared
         return shows, found
 
-    def _look(
-        self, boxes: Tensor, rows: Sequence[int] | slice = slice(None)
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _look(self, boxes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What `may_show` gives; of the corners, [n v 2 8] pixels times z, and [n v 8] z."""
-        forms, edges, near = self._forms[rows], self._edges[rows], self._near[rows]
-        corners = torch.einsum("nca,vpa->nvpc", _corners(boxes), forms[..., :3]) + forms[..., 3:]
+        corners = torch.einsum("nca,vpa->nvpc", _corners(boxes), self._forms[..., :3]) + self._forms[..., 3:]
         xy, z = corners[:, :, :2], corners[:, :, 2]
         low, high = (
-            (edges[:, side, :, None] + sign * self._margin) * z[:, :, None]
+            (self._edges[:, side, :, None] + sign * self._margin) * z[:, :, None]
             for side, sign in ((0, -1), (1, 1))
         )
-        beyond = torch.cat((xy < low, xy > high, (z < near)[:, :, None]), dim=2)
+        beyond = torch.cat((xy < low, xy > high, (z < self._near)[:, :, None]), dim=2)
         # A corner without end may give NaN, which is beyond nothing: then the box may show.
         return ~beyond.all(dim=3).any(dim=2), xy, z
 

@@ -8,8 +8,7 @@ from statistics import median_high
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
-from abcd_ns.engine.space.tree import in_float64
-from abcd_ns.engine.space.visibility import ROUNDING, Frusta, Optics
+from abcd_ns.engine.space.visibility import Frusta, Optics
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.run import TrainingRun
@@ -20,8 +19,8 @@ from abcd_ns.errors import UserError
 
 DOUBTED = 8
 """Views that hardly show a block, as far as known, of which a visit looks at the first that sees it."""
-MANY, SAMPLE = 100, 64
-"""Of a block that more views may see, only so many Gaussians, evenly spaced, are looked for in them."""
+MANY = 100
+"""Of more views than that, only those that a visit uses are asked whether they see the block."""
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many epochs."""
 
@@ -59,7 +58,7 @@ class Planner(Visits):
 
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._config, self._scene = run, run.config, run.scene
-        self._culling: tuple[dict[int, View], Frusta, Frusta, Optics] | None = None
+        self._culling: tuple[dict[int, View], Frusta, Optics] | None = None
         self._since, self._taken = math.inf, 0
         self._of_epoch, self._is_last = 0, False
 
@@ -94,7 +93,7 @@ class Planner(Visits):
             if self._scene.tree.num_blocks == 1:
                 return self._sole_visit(plan.block, views)
             # Where nothing is known, or what shows the block has changed, all views are asked.
-            for ask in (self._known_to_show, self._sampled, self._seeing):
+            for ask in (self._known_to_show, self._many, self._seeing):
                 if (active := self._visit(plan, views, ask(plan.block, views))) is not None:
                     return active
 
@@ -218,7 +217,7 @@ class Planner(Visits):
 
     def _views_seeing(self, block: int) -> int:
         views = self._may_see(block)
-        return len(self._sampled(block, views) or self._seeing(block, views))
+        return len(self._many(block, views) or self._seeing(block, views))
 
     def _known_to_show(self, block: int, views: Iterable[int]) -> tuple[int, ...]:
         """The fewest of these views that show nearly all of the block; empty if that is not known."""
@@ -227,16 +226,9 @@ class Planner(Visits):
             return ()
         return worth_training({view: known[view] for view in views if view in known}, share)
 
-    def _sampled(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
-        """Of MANY views, those in which a mean of the block's lies, as far as SAMPLE tell; of fewer, none."""
-        if len(views) <= MANY:
-            return ()
-        means = self._scene.stored_with_pending(block).means
-        found, _, inner, _ = self._culling
-        rows = [row for row, view in enumerate(found) if view in views]
-        points = in_float64(means[:: -(-len(means) // SAMPLE)]).cpu()
-        holds = inner.may_show(points[:, None].expand(-1, 2, -1), rows).any(dim=0).tolist()
-        return tuple(view for view, held in zip(views, holds, strict=True) if held)
+    def _many(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:  # noqa: ARG002
+        """All that may see the block if they are MANY: a visit asks those whose turn it is."""
+        return tuple(views) if len(views) > MANY else ()
 
     def _seeing(self, block: int, views: Mapping[int, View]) -> tuple[int, ...]:
         return self._footprints(block, views).views
@@ -249,9 +241,8 @@ class Planner(Visits):
         found = self._run.views
         if self._culling is None or self._culling[0] is not found:  # poses moved
             views, slack = list(found.values()), self._run.rasterizer.slack
-            outer, inner = (Frusta(((v, v.full) for v in views), by) for by in (slack, -ROUNDING - 1))
-            self._culling = found, outer, inner, Optics(views, slack)
-        _, frusta, _, optics = self._culling
+            self._culling = found, Frusta(((v, v.full) for v in views), slack), Optics(views, slack)
+        _, frusta, optics = self._culling
         (shows,) = frusta.may_show(optics.drawn_within([bounds])).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 
