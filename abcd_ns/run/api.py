@@ -82,8 +82,9 @@ def train(
     _check_run(steps, options, device, folder)
     _check_views(views, photos)
     _check_points(places, colors)
-    views = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
-    views = _told(as_trained(views, places, options.near_plane))
+    numbered = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
+    views = as_trained(numbered, places, options.near_plane)
+    _warn_of_rounding(views)
 
     def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         pixels = torch.as_tensor(photos[index])[crop.slices]
@@ -93,8 +94,7 @@ def train(
         return sample.reduced(photo(sample.view.index, sample.source)), None
 
     names = [Path(str(view.index)) for view in views]
-    first = partial(cloud_of, places, colors, views, training)
-    capture = Capture(views, names, target, first, len(places))
+    capture = Capture(views, names, target, partial(cloud_of, places, colors, views, training), len(places))
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
     empty, budget = nothing_active(training.sh_degree, device), Budget(steps, options.max_seconds)
     threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
@@ -169,14 +169,12 @@ def _check_views(views: Sequence[View], photos: Sequence[Photo]) -> None:
             raise UserError(f"View {index} has a focal length that no camera has: K must be in pixels.")
 
 
-def _told(views: list[View]) -> list[View]:
-    """The views; logs it where float32 rounds their positions too much."""
+def _warn_of_rounding(views: list[View]) -> None:
     farthest = float(centers_of(views).abs().max())
     off = farthest * torch.finfo(torch.float32).eps
     if off > LOST_DIGITS * min(view.reach for view in views):
         far = f"Cameras are {farthest:,.0f} units from the origin, where float32 rounds to {off:.1g}"
         LOG.warning(f"{far}: the scene may be less sharp. Move views and points near the origin.")
-    return views
 
 
 def _check_run(steps: int, options: RunOptions, device: torch.device, folder: Path) -> None:
