@@ -178,7 +178,7 @@ class BlocksAlone(Visits):
             regions = self._regions(block)
             owns = any(OWN in region for _, region in regions.values())
             state.views[block] = len(regions) if owns else 0
-        state.queue = list(plan_epoch(0, state.views, 1, None, self._run.config.seed))
+        state.queue = list(plan_epoch(0, state.views, 1, self._run.config.seed))
         if not state.queue:
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
 

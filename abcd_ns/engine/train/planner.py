@@ -60,7 +60,6 @@ class Planner(Visits):
         self._run, self._config, self._scene = run, run.config, run.scene
         self._culling: tuple[dict[int, View], Frusta, Optics] | None = None
         self._since, self._taken = math.inf, 0
-        self._of_epoch, self._is_last = 0, False
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; most epochs pass over blocks that no
@@ -153,26 +152,31 @@ class Planner(Visits):
         if not free:
             raise BlocksBusyError
         beside = overlaps(state.influence, (state.queue[place].block for place in free), busy)
-        return self._in_time(state.queue.pop(free[beside.index(min(beside))]))
-
-    def _in_time(self, plan: schedule.VisitPlan) -> schedule.VisitPlan:
-        """The visit; where a limit in seconds leaves less than half an epoch after this one, all that are
-        left of this one become shorter or longer to use it up."""
-        left, waiting = self._views_left(), sum(map(_views_of, (plan, *self._run.state.queue)))
-        self._is_last |= left < waiting + self._of_epoch / 2
-        if self._is_last:
-            plan = plan._replace(steps=max(round(plan.steps * min(left / waiting, 2)), 1))
+        place = free[beside.index(min(beside))]
+        steps = self._steps_of(state.queue[place])
+        plan = state.queue.pop(place)._replace(steps=steps)
         self._since = min(self._since, self._run.stopwatch.seconds)
         self._taken += _views_of(plan)
         return plan
 
-    def _views_left(self) -> float:
-        """That visits may draw in the seconds left, at the pace of those since this process began; infinite
-        without a limit, and where no visit tells."""
-        seconds, now = self._run.budget.seconds, self._run.stopwatch.seconds
-        if seconds is None or now <= self._since:
-            return math.inf
-        return max(seconds - now, 0.0) * self._taken / (now - self._since)
+    def _steps_of(self, plan: schedule.VisitPlan) -> int:
+        """Of a visit in the queue: as many as planned, or, in the last epoch, its share of what is left. An
+        epoch is the last where the budget leaves less than half of one after it."""
+        share, waiting = self._share_left(), sum(map(_views_of, self._run.state.queue))
+        if share * waiting >= waiting + self._run.state.of_epoch / 2:
+            return plan.steps
+        return max(round(plan.steps * min(share, 2)), 1)
+
+    def _share_left(self) -> float:
+        """How often the budget suffices for the visits in the queue; infinite where nothing tells."""
+        budget, state, now = self._run.budget, self._run.state, self._run.stopwatch.seconds
+        shares = [math.inf]
+        if budget.steps is not None:
+            shares.append((budget.steps - state.planned) / sum(plan.steps for plan in state.queue))
+        if budget.seconds is not None and now > self._since:  # at the pace since this process began
+            left = max(budget.seconds - now, 0.0) * self._taken / (now - self._since)
+            shares.append(left / sum(map(_views_of, state.queue)))
+        return min(shares)
 
     def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
@@ -196,12 +200,10 @@ class Planner(Visits):
         if state.epoch % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
-        total = self._run.budget.steps
-        remaining = None if total is None else total - state.planned
         batches = {block: self._views_of_step(block) for block in used}
-        options = passes, remaining, self._config.seed, recipe.visit_steps, batches
+        options = passes, self._config.seed, recipe.visit_steps, batches
         state.queue = list(schedule.plan_epoch(state.epoch, used, *options))
-        self._of_epoch, self._is_last = sum(map(_views_of, state.queue)), False
+        state.of_epoch = sum(map(_views_of, state.queue))
 
     def _views_of_step(self, block: int) -> int:
         """Fewer while the block is under-trained, where its steps are larger for that."""

@@ -157,6 +157,8 @@ class RunState:
     """Visits begun so far."""
     queue: list[VisitPlan] = field(default_factory=list)
     """Visits of this epoch still to come."""
+    of_epoch: int = 0
+    """Views that all visits of this epoch were planned to draw."""
     views: dict[int, int] = field(default_factory=dict)
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)

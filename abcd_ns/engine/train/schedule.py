@@ -8,7 +8,6 @@ import math
 import random
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from itertools import accumulate, pairwise
 from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -60,7 +59,6 @@ def plan_epoch(
     epoch: int,
     views: Mapping[int, int],
     passes: int | float,
-    remaining: int | None,
     seed: int,
     each: int = 0,
     batches: Mapping[int, int] | None = None,
@@ -69,24 +67,13 @@ def plan_epoch(
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
-        remaining: steps left in the budget, or None without one. Where they do not suffice for the epoch,
-            or would leave less than half an epoch behind, all visits are scaled to use up exactly these.
         each: steps of every visit, whatever its views; 0 shares them out by views.
         batches: by block, the views that a step draws; 1 where it is missing.
     """
-    batches = batches or {}
-    seen = {block: count for block, count in sorted(views.items()) if count > 0}
-    order = list(seen)
+    batches, order = batches or {}, sorted(block for block, count in views.items() if count > 0)
     random.Random(f"sweep {seed} {epoch}").shuffle(order)
-    most = max(batches.values(), default=1)
-    weights = {block: 1 if each else count * most // batches.get(block, 1) for block, count in seen.items()}
-    steps = {b: each or math.ceil(passes * count / batches.get(b, 1)) for b, count in seen.items()}
-    full = sum(steps.values())
-    if not seen:
-        return ()
-    if remaining is not None and remaining < full + full // 2:
-        steps = dict(zip(order, _apportion(remaining, [weights[block] for block in order]), strict=True))
-    return tuple(VisitPlan(b, steps[b], batches.get(b, 0)) for b in order if steps[b] > 0)
+    steps = {block: each or math.ceil(passes * views[block] / batches.get(block, 1)) for block in order}
+    return tuple(VisitPlan(block, steps[block], batches.get(block, 0)) for block in order)
 
 
 def views_per_step(batch: int, blocks: int, trained: int | None = None) -> int:
@@ -169,9 +156,3 @@ def sh_degree_at(progress: float, ramp: float, highest: int) -> int:
         return highest
     # 1e-9 keeps degree n exactly at n / highest of the ramp, where the product may fall just below n.
     return min(int(progress / ramp * highest + 1e-9), highest)
-
-
-def _apportion(total: int, weights: list[int]) -> list[int]:
-    """Integers in proportion to `weights` that add up to `total` exactly (cumulative rounding)."""
-    cuts = [total * end // sum(weights) for end in accumulate(weights, initial=0)]
-    return [after - before for before, after in pairwise(cuts)]

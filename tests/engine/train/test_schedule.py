@@ -24,35 +24,16 @@ VIEWS = st.dictionaries(st.integers(0, 30), st.integers(0, 200), min_size=1, max
 
 @given(views=VIEWS, passes=st.integers(1, 6), epoch=st.integers(0, 50), seed=st.integers(0, 5))
 def test_an_epoch_visits_every_seen_block_once_in_proportion_to_its_views(views, passes, epoch, seed):
-    plans = plan_epoch(epoch, views, passes, None, seed)
+    plans = plan_epoch(epoch, views, passes, seed)
     assert {p.block: p.steps for p in plans} == {b: passes * n for b, n in views.items() if n > 0}
     assert len(plans) == len({p.block for p in plans})
 
 
-@given(views=VIEWS, passes=st.integers(1, 6), budget=st.integers(1, 5000), seed=st.integers(0, 3))
-def test_epochs_use_up_the_budget_exactly(views, passes, budget, seed):
-    if not any(views.values()):
-        assert plan_epoch(0, views, passes, budget, seed) == ()
-        return
-    left, epochs = budget, 0
-    while left > 0:
-        plans = plan_epoch(epochs, views, passes, left, seed)
-        assert plans
-        left -= sum(plan.steps for plan in plans)
-        epochs += 1
-    assert left == 0
-
-
 @given(views=VIEWS, passes=st.integers(1, 6), batches=st.dictionaries(st.integers(0, 30), st.integers(1, 4)))
 def test_a_visit_uses_its_views_as_often_whatever_a_step_draws(views, passes, batches):
-    for plan in plan_epoch(0, views, passes, None, 0, batches=batches):
+    for plan in plan_epoch(0, views, passes, 0, batches=batches):
         batch, uses = batches.get(plan.block, 1), passes * views[plan.block]
         assert uses <= plan.steps * batch < uses + batch
-
-
-def test_the_last_epoch_shares_views_also_where_steps_draw_different_numbers():
-    plans = plan_epoch(3, {0: 10, 1: 30}, passes=4, remaining=50, seed=0, batches={0: 1, 1: 2})
-    assert {plan.block: plan.steps for plan in plans} == {0: 20, 1: 30}
 
 
 @pytest.mark.parametrize(
