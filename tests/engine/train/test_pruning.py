@@ -13,7 +13,15 @@ from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.train.density.pruning import PASSES, blend_sums, contributions, floaters, risen, veils
+from abcd_ns.engine.train.density.pruning import (
+    PASSES,
+    blend_sums,
+    contributions,
+    covered,
+    floaters,
+    risen,
+    veils,
+)
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
 from tests.reference.scenes import activated, listen, random_gaussians, whole_scene
@@ -130,7 +138,7 @@ def test_what_veils_a_view_is_what_its_near_plane_hides(start, views):
     scene, rasterizer = Gaussians.cat([start, before_a_camera(views[1], 2)]), TorchRasterizer()
     whole = Shot(replace(views[1], near=NEAR_PLANE), views[1].full)
     (expected,) = weights(scene, rasterizer, [whole])
-    found = veils(scene, views, rasterizer, antialiased=False)
+    found = veils(views, scene, rasterizer, antialiased=False)
     assert float(found[-2:].sum()) > 0.5 * whole.crop.pixels
     torch.testing.assert_close(found[-2:], expected[-2:])
     assert bool((found[:-2] == 0).all())
@@ -147,7 +155,39 @@ def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, v
     scene, rasterizer = whole_scene(coordinator), coordinator.run.rasterizer
     assert len(scene) >= 100
     assert float((scene.means - near[0].center).norm(dim=1).min()) > 0.2
-    assert float(veils(scene, near, rasterizer, antialiased=False).sum()) < 0.01 * near[0].full.pixels
+    assert float(veils(near, scene, rasterizer, antialiased=False).sum()) < 0.01 * near[0].full.pixels
+
+
+@pytest.mark.parametrize("many", [64, 2])
+def test_what_a_gaussian_would_cover_is_what_it_weighs_alone(views, monkeypatch, many):
+    monkeypatch.setattr("abcd_ns.engine.train.density.pruning.MOST_VIEWS", many)
+    scene, rasterizer = random_gaussians(40, seed=1, size=0.12), TorchRasterizer()
+    asked = views if many == 64 else views[:: -(-len(views) // many)]
+    shots = [Shot(view, view.full) for view in asked]
+    alone = [weights(scene[one : one + 1], rasterizer, shots).sum() for one in range(40)]
+    found = covered(views, scene, rasterizer, antialiased=False)
+    expected = torch.stack(alone) * len(views) / len(asked)
+    large = expected > 30
+    assert int(large.sum()) > 20
+    torch.testing.assert_close(found[large], expected[large], rtol=0.1, atol=0.0)
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_what_others_hide_in_all_photos_goes_though_it_fills_some_pixels(make, photos, monkeypatch, blocks):
+    monkeypatch.setattr("abcd_ns.engine.train.step.active_block.SHOWN", 0.3)
+    start, density = random_gaussians(120, seed=1, size=0.2), replace(STILL, min_contribution=1e-6)
+    coordinator = make(start=start, blocks=blocks, steps=60, density=density, batch=1)
+    views, rasterizer = list(coordinator.views.values()), coordinator.run.rasterizer
+
+    def shares(scene: Gaussians) -> torch.Tensor:
+        shown = weights(scene, rasterizer, [Shot(view, view.full) for view in views]).sum(dim=0)
+        return shown / covered(views, scene, rasterizer, antialiased=False)
+
+    assert int((shares(start) < 0.25).sum()) > 40
+    train(coordinator, photos)
+    left = shares(whole_scene(coordinator))
+    assert len(left) > 50
+    assert float(left.min()) > 0.25
 
 
 @pytest.mark.parametrize(("progress", "gone"), [(0.6, [0, 1]), (0.25, [0]), (0.8, [])])

@@ -213,18 +213,18 @@ class DensityControl:
         optimizers: Optimizers,
         growth: dict[str, Tensor],
         progress: float,
-        veils: Float[Tensor, "n"] | float = 0.0,
+        required: Float[Tensor, "n"] | float = 0.0,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's views, at a share of the run; floaters; what veils
-        more than it contributes, see `pruning.veils`; and what is too faint for any picture to show, which
-        nothing would train again. Gives the block's statistics from now on."""
+        """Take out what fills too little of the block's views, at a share of the run, or less than `required`
+        of it, px; floaters; and what is too faint for any picture to show, which nothing would train again.
+        Gives the block's statistics from now on."""
         if not self.config.prunes or not have_contributions(growth):
             return growth
         bounds = self.config.min_contribution, FAINT
         least, faint = (risen(bound, progress, self.config.refine_stop) for bound in bounds)
         opacities = torch.sigmoid(params["opacities"][:, 0])
         found = contributions(growth)
-        drop = (found <= least) | (found < veils) | (opacities < MIN_ALPHA)
+        drop = (found <= least) | (found < required) | (opacities < MIN_ALPHA)
         drop |= floaters(growth, opacities, faint)
         growth = dict(growth)  # rows are taken out of it
         if bool(drop.any()):

@@ -7,6 +7,7 @@ before its block included: so many pixels it fills. Drawings that train it tell 
 a minimum that rises until growth ends.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
@@ -31,6 +32,13 @@ LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 FAINT, FAINTER = 0.1, 0.25
 """What fills more than most is a floater if its opacity is below the first, and this share of the median."""
+SHOWN = 0.003
+"""Share of what a Gaussian would fill if nothing hid it that it must. Photos say next to nothing of one that
+they show less of, and where nothing hides it, it may veil a picture."""
+MOST_VIEWS = 64
+"""As many of a block's views tell what would fill them."""
+LEAST_DET = 1e-12
+"""Of the inverse of a covariance, px^-4, at least."""
 PASSES = 4
 """A block that is the whole scene is judged whenever each of its views was drawn so often."""
 
@@ -95,7 +103,7 @@ def floaters(growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint:
 
 
 def veils(
-    gaussians: Gaussians, views: Sequence[View], rasterizer: Rasterizer, antialiased: bool
+    views: Sequence[View], gaussians: Gaussians, rasterizer: Rasterizer, antialiased: bool
 ) -> Float[Tensor, "n"]:
     """Pixels that each Gaussian would fill of all views from before their near planes. A run draws nothing
     there; other viewers, which get only a file, do."""
@@ -110,6 +118,25 @@ def veils(
         if len(near):  # nothing else is before them
             shot = Shot(replace(view, near=NEAR_PLANE), view.full)
             found[near] += weights(gaussians[near], rasterizer, [shot], antialiased=antialiased)[0]
+    return found
+
+
+def covered(
+    views: Sequence[View], gaussians: Gaussians, rasterizer: Rasterizer, antialiased: bool
+) -> Float[Tensor, "n"]:
+    """Pixels that each Gaussian would fill of all views if nothing hid it, about; 0 for surfels."""
+    means, found = gaussians.means, gaussians.means.new_zeros(len(gaussians))
+    some = views[:: -(-len(views) // MOST_VIEWS) or 1] if rasterizer.primitive.name == "3dgs" else ()
+    for view in some:
+        splats = rasterizer.project(gaussians, view, antialiased=antialiased)
+        xx, xy, yy = splats.shapes.unbind(dim=1)
+        det = (xx * yy - xy * xy).clamp_min(LEAST_DET)
+        sigmas, middles = (torch.stack((yy, xx)) / det).sqrt(), splats.means2d.T
+        size = means.new_tensor([[view.width], [view.height]])
+        # Within the image, as if the axes of its ellipse were the image's.
+        inside = torch.special.ndtr((size - middles) / sigmas) - torch.special.ndtr(-middles / sigmas)
+        pixels = 2 * math.pi * splats.opacities / det.sqrt() * inside.prod(dim=0)
+        found += torch.where(splats.radii > 0, pixels, 0.0) * (len(views) / len(some))
     return found
 
 

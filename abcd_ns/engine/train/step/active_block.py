@@ -14,7 +14,14 @@ from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.growing import Judged
-from abcd_ns.engine.train.density.pruning import contributions, faded, have_contributions, veils
+from abcd_ns.engine.train.density.pruning import (
+    SHOWN,
+    contributions,
+    covered,
+    faded,
+    have_contributions,
+    veils,
+)
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, VisitKind
@@ -138,11 +145,12 @@ class ActiveBlock:
     def prune(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and harmonics that change too little.
         What is seen from now on soon counts for more."""
-        run, before, found = self._run, len(self), 0.0
+        run, before, least = self._run, len(self), 0.0
         if before and run.density.config.prunes and run.share >= run.config.density.refine_stop:
-            active = active_gaussians(run.params).detach()
-            found = veils(active, list(run.views.values()), run.rasterizer, run.config.antialiased)
-        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, found)
+            drawn = active_gaussians(run.params).detach(), run.rasterizer, run.config.antialiased
+            trained_on = [run.views[view] for view in run.active.trained_on]
+            least = veils(list(run.views.values()), *drawn).maximum(SHOWN * covered(trained_on, *drawn))
+        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, least)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()
         self.growth = faded(self.growth)
