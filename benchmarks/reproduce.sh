@@ -19,6 +19,7 @@ rows() { # by the name, minutes, scene, reduction, then options of `abcd compare
     done
     $row splatfacto/fox-shipped 40 fox 4 --steps 30000 --methods splatfacto --evals 15
     $row splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
+    $row splatfacto/castle-P30-640-longer 20 castle-P30 1 --steps 9000 --methods abcd-monolithic
     $row budgets/castle-P30 20 castle-P30 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
     for scene in fox caliterra bonsai; do
         $row budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
