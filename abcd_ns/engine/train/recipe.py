@@ -57,7 +57,7 @@ class Recipe:
     """Views that every block counts as trained on when the run begins."""
 
 
-FULL = 0.75
+FULL = 0.9
 """Share of its limit over which a block is cut: the next visit needs room to grow."""
 
 

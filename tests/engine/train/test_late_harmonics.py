@@ -8,7 +8,7 @@ from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, whole_scene
 
 LATE = {"blocks": 4, "steps": 96, "density": STILL, "late_harmonics": 2}
-ROOMY, TIGHT = 1000, 41
+ROOMY, TIGHT = 1000, 34
 """Gaussians that a block may have while it grows; there are 30."""
 
 
