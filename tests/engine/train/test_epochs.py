@@ -12,7 +12,7 @@ from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.planner import LOOK_AGAIN
 from abcd_ns.engine.train.run_state import BlockHealth, Budget, Stopwatch
-from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.train.schedule import plan_epoch, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, listen, stop
@@ -114,6 +114,21 @@ def test_blocks_share_what_a_limit_leaves_for_the_last_epoch(make, photos, limit
     # How long a step takes is known after the first visit.
     last = [visit.steps for visit in began[limit == "seconds" :] if visit.epoch == epochs - 1]
     assert max(last, default=0) - min(last, default=0) <= 1
+
+
+def test_the_last_epoch_shares_views_also_where_steps_draw_different_numbers(make, photos, monkeypatch):
+    def mixed(epoch, views, passes, seed, each, batches):
+        return plan_epoch(epoch, views, passes, seed, each, {block: 1 + block % 2 for block in batches})
+
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.plan_epoch", mixed)
+    coordinator = make(blocks=4, steps=140, warmup=0.0, density=STILL)
+    began = listen(coordinator, VisitBegan)
+    train(coordinator, photos)
+    last = max(visit.epoch for visit in began)
+    shares = {v.block: v.steps * (1 + v.block % 2) / v.views for v in began if v.epoch == last}
+    assert (coordinator.state.step, len(shares)) == (140, 4)
+    assert max(shares.values()) - min(shares.values()) <= 2 / 5
+    assert min(shares.values()) > 4  # of the usual epochs
 
 
 def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):

@@ -22,6 +22,7 @@ from abcd_ns.engine.train.density.pruning import (
     risen,
     veils,
 )
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
 from tests.reference.scenes import activated, listen, random_gaussians, whole_scene
@@ -162,7 +163,8 @@ def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, v
 def test_what_a_gaussian_would_cover_is_what_it_weighs_alone(views, monkeypatch, many):
     monkeypatch.setattr("abcd_ns.engine.train.density.pruning.MOST_VIEWS", many)
     scene, rasterizer = random_gaussians(40, seed=1, size=0.12), TorchRasterizer()
-    asked = views if many == 64 else views[:: -(-len(views) // many)]
+    asked = evenly(views, many)
+    assert len(asked) == min(many, len(views))
     shots = [Shot(view, view.full) for view in asked]
     alone = [weights(scene[one : one + 1], rasterizer, shots).sum() for one in range(40)]
     found = covered(views, scene, rasterizer, antialiased=False)

@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from abcd_ns.engine.render import Raster, Rasterizer, Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.space.visibility import widest_slant
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View, centers_of
 
 BLEND_SUMS = ("weight", "passes")
@@ -126,7 +127,7 @@ def covered(
 ) -> Float[Tensor, "n"]:
     """Pixels that each Gaussian would fill of all views if nothing hid it, about; 0 for surfels."""
     means, found = gaussians.means, gaussians.means.new_zeros(len(gaussians))
-    some = views[:: -(-len(views) // MOST_VIEWS) or 1] if rasterizer.primitive.name == "3dgs" else ()
+    some = evenly(views, MOST_VIEWS) if rasterizer.primitive.name == "3dgs" else []
     for view in some:
         splats = rasterizer.project(gaussians, view, antialiased=antialiased)
         xx, xy, yy = splats.shapes.unbind(dim=1)
