@@ -132,8 +132,10 @@ class TrainingRun:
 
     @property
     def limits(self) -> Limits:
-        """What a block may have at the present degree of harmonics."""
-        return limits_at(self.config, self.state.sh_degree)
+        """What a block may have at the present degree of harmonics; one among others, once growth is over, at
+        the highest, so that visits cut what has no room for that."""
+        grown = self.blocks > 1 and self.share >= self.config.density.refine_stop
+        return limits_at(self.config, self.config.sh_degree if grown else self.state.sh_degree)
 
     @property
     def active(self) -> ActiveVisit:

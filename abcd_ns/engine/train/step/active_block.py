@@ -12,7 +12,7 @@ from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos
-from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
+from abcd_ns.engine.train.density.degrees import GONE, LATE_START, START, are_gone, lower
 from abcd_ns.engine.train.density.growing import Judged
 from abcd_ns.engine.train.density.pruning import (
     SHOWN,
@@ -66,8 +66,8 @@ class ActiveBlock:
         run.health.begin_visit(active, run.state.health)
         self.growth = {name: value.clone() for name, value in stored.growth.items()}
         self.clocks = stored.clocks
-        begins, come_late = active.done == 0 and not active.saved, run.config.limits.late_harmonics > 0
-        if begins and not (active.is_alone or come_late):  # which may have had no time to be of use
+        begins = active.done == 0 and not active.saved
+        if begins and not active.is_alone:  # which may have had no time to be of use
             self._lower_degrees()
         if begins and self.clocks.visits == 0:
             run.health.shrink_oversized(run.views.values(), self._filling())
@@ -158,7 +158,8 @@ class ActiveBlock:
     def _lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
         run = self._run
-        if run.density.config.prunes and run.share >= START:
+        start = LATE_START if run.config.limits.late_harmonics else START
+        if run.density.config.prunes and run.share >= start:
             views = [run.views[view] for view in run.active.trained_on]
             self.growth = lower(run.params, run.optimizers, self.growth, views, self._highest)
 
