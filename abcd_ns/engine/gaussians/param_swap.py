@@ -30,6 +30,8 @@ RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
 UNDER_TRAINED_RATES = 4.0
 """Times as large they are before, at most; a step of four views is as large as that by itself."""
+LATE_RATE = 3.0
+"""Times as large is that of harmonics which come late, as they have half of a run at most."""
 
 PINNED_BYTES = 256 << 20
 """Of RAM that is pinned to copy a block from a GPU, at most: torch gives none of it back."""
@@ -127,12 +129,16 @@ def nothing_active(
 
 class Pace:
     """Learning rates and memories of the optimizers, as they were given for steps of one view each. With
-    `fast_start` rates are larger while a block has had few steps, see `rates_of_under_trained`."""
+    `fast_start` rates are larger while a block has had few steps, see `rates_of_under_trained`. Harmonics may
+    be `late`, see LATE_RATE."""
 
-    def __init__(self, optimizers: Optimizers, fast_start: bool) -> None:
+    def __init__(self, optimizers: Optimizers, fast_start: bool, late: bool = False) -> None:
         groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
         self._optimizers, self._fast_start = optimizers, fast_start
         self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
+        if late:
+            rate, betas = self._given["features_rest"]
+            self._given["features_rest"] = LATE_RATE * rate, betas
 
     def set(self, batch: int, trained: int, means_decay: float, damping: float = 1.0) -> None:
         """For a step of `batch` views on a block that was trained on so many, with the means' rate at a share

@@ -43,7 +43,8 @@ class VisitTraining:
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
-        self._pace = Pace(run.optimizers, run.config.recipe.fast_start)
+        late = run.config.limits.late_harmonics > 0
+        self._pace = Pace(run.optimizers, run.config.recipe.fast_start, late)
         self._backgrounds = Backgrounds(run.config, run.device)
         self._order: tuple[int, ...] = ()
         self._reach = 1.0

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import Pace, adam_step, attach, detach, nothing_active
+from abcd_ns.engine.gaussians.param_swap import LATE_RATE, Pace, adam_step, attach, detach, nothing_active
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
 
@@ -33,14 +33,17 @@ def test_views_that_agree_come_as_far_together_as_one_by_one(views):
     assert together == pytest.approx(one_by_one, rel=1e-2)
 
 
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 2, 4), (2_000, 4, 4), (10_000, 1, 1)]
 )
-def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
+def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times, late):
+    """And harmonics that come late larger ones still."""
     _, adam = nothing_active(sh_degree=0)
     given = {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES}
-    Pace(adam, fast_start=True).set(batch, views, means_decay=0.5)
-    expected = {name: times * rate * (0.5 if name == "means" else 1.0) for name, rate in given.items()}
+    Pace(adam, fast_start=True, late=late).set(batch, views, means_decay=0.5)
+    shares = {"means": 0.5, "features_rest": LATE_RATE if late else 1.0}
+    expected = {name: times * rate * shares.get(name, 1.0) for name, rate in given.items()}
     assert {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES} == pytest.approx(expected)
 
 

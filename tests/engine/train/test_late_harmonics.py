@@ -4,6 +4,7 @@ import pytest
 
 from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
+from abcd_ns.engine.train.memory import limits_at
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import STILL, assert_resumes, whole_scene
 
@@ -32,9 +33,23 @@ def test_what_is_active_has_no_more_harmonics_than_are_in_use(make, photos, star
     assert highest_of(coordinator) == start.sh_degree
 
 
-def test_where_there_is_no_room_they_do_not_come(make, photos):
-    coordinator = make(block_limit=TIGHT, **LATE)
+def test_blocks_that_have_no_room_for_them_are_cut_in_two_when_growth_is_over(make, photos, start):
+    coordinator, blocks = make(block_limit=TIGHT, **LATE), set()
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        blocks.add((coordinator.run.share < 0.5, coordinator.scene.tree.num_blocks))
+    assert {count for is_early, count in blocks if is_early} == {4}
+    assert highest_of(coordinator) == start.sh_degree
+    room = limits_at(coordinator.config, start.sh_degree)
+    assert not any(
+        room.is_full(coordinator.scene.count(b), 8) for b in range(coordinator.scene.tree.num_blocks)
+    )
+
+
+def test_a_single_block_without_room_goes_on_without_them(make, photos):
+    coordinator = make(block_limit=4 * TIGHT, **{**LATE, "blocks": 1})
     train(coordinator, photos)
+    assert coordinator.scene.tree.num_blocks == 1
     assert highest_of(coordinator) == 0
 
 
