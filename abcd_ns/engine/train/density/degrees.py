@@ -24,7 +24,7 @@ from abcd_ns.engine.types import Gaussians, View
 GONE = "gone"
 """Among a block's statistics: by how many degrees a Gaussian's harmonics end below the highest."""
 START, LATE_START = 0.5, 0.9
-"""Share of the run from which on degrees go: they have been trained by then, the second where they come late."""
+"""Share of the run from which on degrees go: trained by then, also where they come after growth."""
 NUMBER_COST = 1e-3
 """What a coefficient, of one channel, must change in the pictures: pixels times a colour's square, 0..1."""
 MOST_VIEWS = 64
