@@ -1,4 +1,4 @@
-"""Commands in the documents are understood, links lead somewhere, README's decibels are of stored runs."""
+"""Commands in the documents are understood, links lead somewhere, numbers are those of runs and the code."""
 
 import functools
 import json
@@ -20,11 +20,13 @@ from nerfstudio.scripts.viewer.run_viewer import RunViewer
 
 from abcd_ns.cli import main as cli
 from abcd_ns.cli import train
+from abcd_ns.engine.train.memory import DeviceNeeds
 from benchmarks.tables import PAGE, with_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 DOCUMENTS.append(ROOT / "docs" / "results" / "README.md")
+TUTORIAL, REFERENCE = ((ROOT / "docs" / name).read_text() for name in ("tutorial.md", "reference.md"))
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 LINK = re.compile(r"\]\(([^)]+)\)|<img src=\"([^\"]+)\"")
 NERFSTUDIO: dict[str, Any] = {
@@ -34,6 +36,10 @@ NERFSTUDIO: dict[str, Any] = {
     "ns-export": Export,
     "ns-render": Render,
 }
+BUDGETS = (4, 6, 8, 12, 24)
+"""GiB."""
+PHOTOS = (1, 2, 8)
+"""Megapixels."""
 
 
 def commands(text: str) -> Iterator[str]:
@@ -140,3 +146,28 @@ def test_what_the_results_are_reproduced_by_is_understood():
     assert len(commands) > 15
     for command in commands:
         parse(command)
+
+
+def memory_table() -> str:
+    """Millions of Gaussians in a block; a dash where not even a small one fits."""
+    lines = [
+        "| photos | " + " | ".join(f"{budget} GiB" for budget in BUDGETS) + " |",
+        "| --- |" + " ---: |" * len(BUDGETS),
+    ]
+    for megapixels in PHOTOS:
+        needs = DeviceNeeds(megapixels * 10**6, batch=1, waiting=3)
+        limits = [needs.block_limit(budget << 30) / 1e6 for budget in BUDGETS]
+        cells = [f"{limit:.1f} million" if limit > 0 else "-" for limit in limits]
+        lines.append(f"| {megapixels} megapixels | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def test_what_a_gaussian_takes_is_what_the_reference_says():
+    takes = [DeviceNeeds(1, batch=1, waiting=3, active_degree=degree).gaussian_bytes for degree in (0, 3)]
+    assert "takes {:,} bytes instead of {:,}".format(*takes) in REFERENCE.replace("\n", " ")
+    assert f"up to {takes[1] / takes[0]:.1f} times as many" in TUTORIAL.replace("\n", " ")
+
+
+def test_the_table_of_memory_is_that_of_the_model():
+    shown = TUTORIAL.split("<!-- memory:begin -->\n")[1].split("\n<!-- memory:end -->")[0]
+    assert shown == memory_table()

@@ -70,11 +70,8 @@ def complaints(rule: Rule, paths: list[Path]) -> list[str]:
 def config_files() -> list[Path]:
     """The files that configure, install or build, but no results and no environment."""
     wanted = {".toml", ".txt", ".cfg", ".ini", ".yml", ".yaml", ".sh"}
-    top = [
-        p
-        for p in ROOT.iterdir()
-        if p.suffix in wanted or p.name in ("Makefile", ".importlinter", ".gitignore")
-    ]
+    names = {"Makefile", ".importlinter", ".gitignore"}
+    top = [path for path in ROOT.iterdir() if path.suffix in wanted or path.name in names]
     folders = [ROOT / name for name in (".ci", ".github", "docker", "scripts")]
     return sorted(top + [p for folder in folders for p in folder.rglob("*") if p.is_file()])
 
@@ -82,9 +79,8 @@ def config_files() -> list[Path]:
 def text_files() -> list[Path]:
     """Config, documents and code; not this file, which has to name what it looks for."""
     documents = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    return [
-        p for p in [*config_files(), *documents, *PACKAGE_FILES, *TEST_FILES] if p != Path(__file__).resolve()
-    ]
+    found = [*config_files(), *documents, *PACKAGE_FILES, *TEST_FILES]
+    return [path for path in found if path != Path(__file__).resolve()]
 
 
 @pytest.mark.parametrize(

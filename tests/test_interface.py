@@ -34,7 +34,6 @@ def test_the_methods_are_listed():
 
 def test_a_config_of_before_the_move_names_what_opens_it():
     old = "!!python/object:abcd_ns.plugin.config.AbcdTrainerConfig\nmethod_name: abcd\n"
-    with pytest.raises(
-        yaml.constructor.ConstructorError, match=r"the version that trained it: abcd/settings\.json"
-    ):
+    says = r"the version that trained it: abcd/settings\.json"
+    with pytest.raises(yaml.constructor.ConstructorError, match=says):
         yaml.load(old, Loader=yaml.Loader)

@@ -188,7 +188,6 @@ class Shown:
         return int((here & drawn).sum())
 
     def gaussians(self, block: int) -> Gaussians:
-        """Those Gaussians."""
         found = Gaussians(**self._load(block, PARAM_NAMES))
         found = found[self._here(self._placed(found.means)) & shows(found.opacities)]
         if not len(found):

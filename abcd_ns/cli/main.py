@@ -28,7 +28,6 @@ class Command(NamedTuple):
     """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function."""
         module, function = self.target.split(":")
         return getattr(importlib.import_module(module), function)
 

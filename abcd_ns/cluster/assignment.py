@@ -126,7 +126,6 @@ class Member:
         return assignment
 
     def seen(self) -> WorkerSeen:
-        """What it is doing."""
         now, visit = time.monotonic(), self.assignment and self.assignment.task.active
         waited = self.waited + (now - self.free_since if self.is_idle else 0.0)
         share = min(waited / max(now - self.since, 1e-9), 1.0) if self.since else 0.0
@@ -175,7 +174,6 @@ class Workers(ABC):
         """What has happened, in order; waits `seconds` at most. WorkersError says what no worker could do."""
 
     def seen(self) -> Sequence[WorkerSeen]:
-        """What each is doing."""
         return [member.seen() for member in self._members]
 
     @abstractmethod

@@ -138,7 +138,6 @@ class Dispatcher(Coordinator):
             return False
         state, scene, block, light = self.state, self.scene, active.geometry.block, self.run.light
         blocks = range(scene.tree.num_blocks)
-        migrants = scene.pending_for(block)
         task = VisitTask(
             active=active,
             tree=scene.tree,
@@ -157,8 +156,8 @@ class Dispatcher(Coordinator):
         state.in_flight.append(active)
         own = self.workers.share(with_pending(scene, block))
         assignment = Assignment(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
-        ends = self._ended + active.steps * max(active.batch, 1)
-        self._in_flight.append(InFlight(active, assignment, len(migrants or ()), ends))
+        taken, ends = len(scene.pending_for(block) or ()), self._ended + active.steps * max(active.batch, 1)
+        self._in_flight.append(InFlight(active, assignment, taken, ends))
         self._submit()
         return True
 

@@ -76,8 +76,7 @@ class ForkedWorkers(Workers):
 
     def __init__(self, count: int, worker: VisitWorker) -> None:
         self._worker, self._owner, now = worker, os.getpid(), time.monotonic()
-        self._stood_still = RawValue(ctypes.c_double, 0.0)
-        """Seconds in all; processes that were forked read it, too."""
+        self._stood_still = RawValue(ctypes.c_double, 0.0)  # seconds in all; forked processes read it, too
         self._held_since: float | None = None
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 

@@ -86,7 +86,6 @@ class Actor:
         return os.getpid()
 
     def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> VisitOutcome:
-        """Train a block."""
         self._seen = 0, math.nan
         return self._worker.visit(task, state(), drawn, self._hear)
 
@@ -141,15 +140,12 @@ class RayWorkers(Workers):
                 reports += self._answer_of(by_ref[ref])
             elif ref == by_ref[ref].asked:
                 reports += self._end_of(by_ref[ref], ref)
-        return reports + [report for member in self._members for report in self._give_up(member)]
-
-    def _give_up(self, member: Remote) -> list[Report]:
-        """Replace one that has not answered for too long."""
-        patience = SILENCE if member.ready else SLOW_START
-        waits = member.question is not None or not member.ready
-        if not waits or time.monotonic() - member.asked_at <= patience:
-            return []
-        return self._replace(member, f"silent for {patience:.0f} s")
+        for member in self._members:
+            patience = SILENCE if member.ready else SLOW_START
+            waits = member.question is not None or not member.ready
+            if waits and time.monotonic() - member.asked_at > patience:
+                reports += self._replace(member, f"silent for {patience:.0f} s")
+        return reports
 
     def close(self) -> None:
         for member in self._members if ray.is_initialized() else []:

@@ -100,7 +100,6 @@ class OnAssignment(Visits):
         self._run, self._task, self._begun = run, task, begun
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - there is but one
-        """The one visit that there is."""
         return self._run.active
 
     def room(self) -> int | None:

@@ -103,7 +103,7 @@ def _count_photos(model: Path) -> int:
     if path is None:
         return 0
     if path.suffix == ".txt":
-        return (sum(1 for _ in _lines(path)) + 1) // 2
+        return (sum(1 for _ in _lines(path, blank=True)) + 1) // 2
     try:
         return _Cursor(path).take("Q")[0]
     except InputError:  # another model may be sound
@@ -172,7 +172,6 @@ class _Cursor:
         return struct.unpack_from("<" + layout, self.data, start)
 
     def check(self, sound: bool, fault: str) -> None:
-        """Refuse a file that is not sound."""
         if not sound:
             raise InputError(f"{self.path} {fault}; copy or make it again.")
 
@@ -249,12 +248,12 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return xyz, rgb
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(number from 1, text) of all lines but comments; blank ones too: an image may have no 2D points."""
+def _lines(path: Path, blank: bool = False) -> Iterator[tuple[int, str]]:
+    """(number from 1, text) of all lines but comments; `blank` ones too: an image may have no 2D points."""
     check_regular(path, "file")
     with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
         for number, line in enumerate(file, start=1):
-            if not line.startswith("#"):
+            if not line.startswith("#") and (blank or line.strip()):
                 yield number, line.strip()
 
 
@@ -265,8 +264,6 @@ def _broken_line(path: Path, number: int) -> InputError:
 def _cameras_txt(path: Path) -> dict[int, Lens]:
     sizes, lenses = dict(CAMERA_MODELS.values()), {}
     for number, line in _lines(path):
-        if not line:
-            continue
         try:
             camera, model, width, height, *params = line.split()
             camera, width, height = int(camera), int(width), int(height)
@@ -283,7 +280,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
     """Each image takes two lines: the pose, and its 2D points, which may be none."""
-    images, lines = [], _lines(path)
+    images, lines = [], _lines(path, blank=True)
     for number, line in lines:
         if not line:
             continue
@@ -307,8 +304,6 @@ def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
 def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
     xyz, rgb = [], []
     for number, line in _lines(path):
-        if not line:
-            continue
         try:
             _, x, y, z, red, green, blue, *_ = line.split(maxsplit=7)
             xyz.append((float(x), float(y), float(z)))

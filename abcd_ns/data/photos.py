@@ -34,8 +34,7 @@ class PhotoSource:
 
     path: Path
     stored: tuple[int, int]  # (width, height) that the file must have; EXIF orientation is not applied
-    reduced: tuple[int, int]
-    """(width, height) after area averaging; equal to `stored` where nothing is to be reduced."""
+    reduced: tuple[int, int]  # (width, height) after area averaging; `stored` where nothing is to be reduced
     undistortion: Undistortion | None = None
     """From the reduced photo to the final one; None leaves the pixels as they are."""
     mask_path: Path | None = None

@@ -24,8 +24,7 @@ _COLORS = tuple(
     (f"{prefix}{red}", f"{prefix}{green}", f"{prefix}{blue}")
     for red, green, blue in (("red", "green", "blue"), ("r", "g", "b"))
     for prefix in ("", "diffuse_", "vertex_", "scalar_")
-)
-"""What programs call colours, in lower case."""
+)  # what programs call colours, in lower case
 _HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 """What files of Gaussians have in their place: colour = 0.5 + Y00 x coefficient (Kerbl et al., 2023)."""
 _MOST = 20.0  # of an opacity's logit, and of minus a scale's logarithm, which files may hold as infinite

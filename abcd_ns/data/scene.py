@@ -75,8 +75,7 @@ class SplitLists:
 
     train: frozenset[str]
     held_out: frozenset[str]
-    fault: InputError | None = None
-    """Why they are no split; raised where one is needed."""
+    fault: InputError | None = None  # why they are no split; raised where one is needed
 
     def rows(self, names: Sequence[str], split: str) -> list[int]:
         """Rows of `names` that belong to "train", or else to the views held out."""
@@ -92,16 +91,14 @@ class Scene:
 
     model: Path  # the file or folder that was read, for messages
     root: Path  # the data root; no path leads out of it
-    photo_folder: Path
-    """Holds the photos. Reduced copies may lie beside it, as in images_4."""
+    photo_folder: Path  # holds the photos; reduced copies may lie beside it, as in images_4
     frames: list[Frame]
     points_xyz: np.ndarray  # float64 [n, 3], world of the Scene
     points_rgb: np.ndarray | None  # uint8 [n, 3]; None where the model gives no colours
     applied_transform: np.ndarray = field(default_factory=lambda: np.eye(4)[:3])
     """float64 [3, 4]: world of the Scene = applied_scale x (applied_transform @ original coordinates)."""
     applied_scale: float = 1.0
-    split_lists: SplitLists | None = None
-    """Which frames are trained on and which are held out, if the data say so."""
+    split_lists: SplitLists | None = None  # which frames are trained on and held out, if the data say so
     notes: list[str] = field(default_factory=list)  # what the user should know but need not repair
 
 

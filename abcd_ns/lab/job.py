@@ -52,7 +52,6 @@ class Settings:
 
     @property
     def scene(self) -> str:
-        """The name of the scene: its folder's."""
         return scene_name(self.data)
 
     @property

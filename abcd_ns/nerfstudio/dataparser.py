@@ -66,6 +66,8 @@ class AbcdDataParser(DataParser):
         super().__init__(config)
         self.downscale_factor: int | None = None
         """nerfstudio sets 1 where a trained scene is viewed or exported: photos may then be absent."""
+        self.tells = True
+        """Whether what was noticed is printed when the scene is read."""
         self._prepared: Prepared | None = None
 
     @property
@@ -80,7 +82,7 @@ class AbcdDataParser(DataParser):
             if options.as_stored and options.downscale_factor is None:
                 options = replace(options, downscale_factor=1)
             self._prepared = prepare(options, needs_photos=self.downscale_factor is None)
-            for note in (*self._prepared.chosen, *self._prepared.notes):
+            for note in (*self._prepared.chosen, *self._prepared.notes) if self.tells else ():
                 say(one_line(note), "yellow")
         return self._prepared
 

@@ -173,11 +173,9 @@ class AbcdModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What is no parameter: the tree, the near plane, refined poses and the names of their photos."""
-        poses = {"poses": self.poses, "photos": self._photos}
-        return {"tree": self.tree.to_json(), "near": self.near, **poses}
+        return {"tree": self.tree.to_json(), "near": self.near, "poses": self.poses, "photos": self._photos}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over what `get_extra_state` returned."""
         self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
         self._poses = state.get("poses", {})

@@ -74,6 +74,5 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
         )
     data.device_photo_bytes = device_photo_bytes
 
-    drawn_by, primitive = config.pipeline.model.rasterizer, setup.config.primitive
-    rasterizer = make_rasterizer(drawn_by, device, primitive=primitive)
+    rasterizer = make_rasterizer(config.pipeline.model.rasterizer, device, primitive=setup.config.primitive)
     return VisitWorker(setup, rasterizer, data.target, device, data.read_ahead)

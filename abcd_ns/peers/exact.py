@@ -21,7 +21,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted, StepTaken
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
+from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
@@ -221,7 +221,15 @@ class ExactTrainer(Trainer):
             optimizer.step()
         steps, views = state.clocks.steps + taken, state.clocks.adam_views + taken
         clocks = replace(state.clocks, steps=steps, adam_views=views)
-        clock = self._clock_of(len(state), clocks, taken)
+        limit, everything = self.config.density.limit, max(self.count(), 1)
+        clock = DensityClock(
+            progress=self.progress,
+            steps=clocks.steps,
+            taken=taken,
+            views=len(self.views),
+            refined=clocks.refined,
+            room=None if limit is None else max(limit - everything, 0) * len(state) // everything,
+        )
         growth = {name: value.to(self.device) for name, value in state.growth.items()}
         judged = self._judged(gradients.sums[:, rows])
         growth, refined = self.run.density.after_step(self.params, self.optimizers, growth, (), judged, clock)
@@ -243,14 +251,3 @@ class ExactTrainer(Trainer):
             Judged(sample.view, own.to(self.device), residual.square().sum(dim=-1).mean(), sample.share)
             for sample, own, residual in zip(self._batch.samples, sums, self._residuals, strict=True)
         ]
-
-    def _clock_of(self, gaussians: int, clocks: Clocks, taken: int) -> DensityClock:
-        limit, everything = self.config.density.limit, max(self.count(), 1)
-        return DensityClock(
-            progress=self.progress,
-            steps=clocks.steps,
-            taken=taken,
-            views=len(self.views),
-            refined=clocks.refined,
-            room=None if limit is None else max(limit - everything, 0) * gaussians // everything,
-        )

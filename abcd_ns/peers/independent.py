@@ -136,7 +136,7 @@ class BlocksAlone(Visits):
         """Others see the block as it will be merged."""
         block = active.geometry.block
         self._regions(block)  # found now, not in the first step
-        begun = sum(self._scene.rows(initial_of(b)) for b in self._blocks)
+        begun = sum(self._scene.rows(initial_of(b)) for b in range(self._run.blocks))
         self._part = len(self._joined(block)) / begun
         cell = self._scene.tree.cell(block)
 
@@ -167,14 +167,10 @@ class BlocksAlone(Visits):
             wanted.append(target * counts)
         return shown, wanted
 
-    @property
-    def _blocks(self) -> range:
-        return range(self._scene.tree.num_blocks)
-
     def _plan(self) -> None:
         """One visit to every block that owns a pixel, weighed by the views that say something about it."""
         state = self._run.state
-        for block in self._blocks:
+        for block in range(self._run.blocks):
             regions = self._regions(block)
             owns = any(OWN in region for _, region in regions.values())
             state.views[block] = len(regions) if owns else 0
@@ -202,7 +198,7 @@ class BlocksAlone(Visits):
 
     def _joined(self, block: int) -> BlockState:
         """The block as it begins: its own, and as many of the others in its enlarged cell as have room."""
-        box, others = self._box(block), [b for b in self._blocks if b != block]
+        box, others = self._box(block), [b for b in range(self._run.blocks) if b != block]
         own, *around = [self._scene.stored(initial_of(b)) for b in [block, *others]]
         joined = join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
         room = (self._run.config.limits.sole_limit or len(joined)) - len(own)

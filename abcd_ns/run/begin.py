@@ -51,18 +51,13 @@ that training may take."""
 class Capture:
     """What a run is trained on."""
 
-    views: list[View]
-    """The training views, by row."""
-    photos: Sequence[Path]
-    """Their files; a run resumes only on photos of the same names and sizes."""
-    target: Callable[[Sample], Target]
-    """Returns what a sample is trained on."""
+    views: list[View]  # the training views, by row
+    photos: Sequence[Path]  # their files; a run resumes only on photos of the same names and sizes
+    target: Callable[[Sample], Target]  # returns what a sample is trained on
     cloud: Callable[[], PointCloud | Gaussians]
     """Makes what a new run begins with: Gaussians are trained already and have no warm-up."""
-    points: int
-    """Of the capture; 0 where the run begins with others."""
-    factor: int = 1
-    """By which the photos' width and height were divided."""
+    points: int  # of the capture; 0 where the run begins with others
+    factor: int = 1  # by which the photos' width and height were divided
 
     @property
     def pixels(self) -> int:

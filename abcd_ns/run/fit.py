@@ -27,22 +27,17 @@ FEW = 4  # blocks: each step trains one, so where there would be more, fewer har
 PICTURE_SHARE = 0.75
 """Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000  # pixels: smaller parts of a view are mostly border
-BLOCKS_EACH = 2
-"""Blocks for each worker at least, where their number is not given: one in training, one stored."""
+BLOCKS_EACH = 2  # blocks for each worker at least, if no number is given: one in training, one stored
 
 
 @dataclass(frozen=True)
 class Fit:
     """What a budget allows."""
 
-    blocks: int
-    """To begin with: as few as hold the initial Gaussians."""
-    budget: int
-    """Bytes of the device that training may take."""
-    gaussians: int
-    """Expected in the whole scene at the end."""
-    limits: Limits
-    """What a run keeps to. `block_limit` is 0 where there is no room for several blocks."""
+    blocks: int  # to begin with: as few as hold the initial Gaussians
+    budget: int  # bytes of the device that training may take
+    gaussians: int  # expected in the whole scene at the end
+    limits: Limits  # what a run keeps to; `block_limit` is 0 where there is no room for several blocks
 
     @property
     def blocks_at_the_end(self) -> int:
@@ -82,17 +77,12 @@ def device_budget(wanted_gb: float, device: torch.device) -> int:
 class Demand:
     """What is to be trained on a device."""
 
-    pixels: int
-    """Of the largest image."""
-    points: int
-    """Gaussians that the scene begins with."""
+    pixels: int  # of the largest image
+    points: int  # Gaussians that the scene begins with
     training: TrainingConfig
-    factor: int = 1
-    """By which the photos were reduced."""
-    blocks: int = 1
-    """That there are already."""
-    on_cpu: bool = False
-    """Whether layers and photos are kept in RAM, under a budget of their own."""
+    factor: int = 1  # by which the photos were reduced
+    blocks: int = 1  # that there are already
+    on_cpu: bool = False  # whether layers and photos are kept in RAM, under a budget of their own
 
     @property
     def first(self) -> int:
@@ -285,12 +275,9 @@ def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device:
 class RamShares:
     """Bytes for what could be read or drawn again. None of them changes a result."""
 
-    photos: int
-    """Decoded photos."""
-    blocks: int
-    """Frozen blocks, read from the store."""
-    layers: int
-    """A visit's layers; where there is a GPU, those that have no room there."""
+    photos: int  # decoded photos
+    blocks: int  # frozen blocks, read from the store
+    layers: int  # a visit's layers; where there is a GPU, those that have no room there
 
     @staticmethod
     def of(gibibytes: float) -> "RamShares":

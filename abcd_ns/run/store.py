@@ -24,20 +24,16 @@ class Start:
     """What a run resumes from."""
 
     store: Path
-    pin: str | None
-    """The pin of a checkpoint that was asked for; None is the newest generation."""
-    step: int
-    """Steps that were taken until then."""
+    pin: str | None  # of a checkpoint that was asked for; None is the newest generation
+    step: int  # steps that were taken until then
 
 
 @dataclass(frozen=True)
 class MadeFor:
     """What a store and a run that resumes from it must agree on."""
 
-    photos: str
-    """Digest of the training photos' names and sizes; their folder may be moved."""
-    first_camera: list[float]
-    """Its position, world units, to three digits."""
+    photos: str  # digest of the training photos' names and sizes; their folder may be moved
+    first_camera: list[float]  # its position, world units, to three digits
     blocks_are_trained: str
     """In turn, jointly, or each alone: what the store holds besides blocks depends on it."""
     sh_degree: int
@@ -47,7 +43,6 @@ class MadeFor:
 
     @staticmethod
     def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
-        """Of a run on these photos and cameras."""
         digest = hashlib.blake2b(digest_size=8)
         for photo, view in zip(photos, views, strict=True):
             digest.update(f"{photo.name} {view.width} {view.height}\n".encode("utf-8", "surrogateescape"))
@@ -71,7 +66,6 @@ class MadeFor:
         return "; ".join(f"{name.replace('_', ' ')} {theirs[name]}, not {mine[name]}" for name in different)
 
     def header(self) -> dict[str, Any]:
-        """The entry of a store's header."""
         return {MADE_FOR: asdict(self)}
 
 

@@ -33,8 +33,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 THIS_MACHINE = "127.0.0.1"  # the host to listen on: reached from this machine alone
-WILDCARDS = ("0.0.0.0", "::", "")
-"""Hosts that a server binds to in order to be reached under all addresses of the machine."""
+WILDCARDS = ("0.0.0.0", "::", "")  # hosts to bind to, to be reached under all addresses of the machine
 SHARE_DOMAIN = ".share.viser.studio"  # names under which viser's public tunnel makes a viewer available
 ASPECTS = (0.01, 100.0)  # width over height of a window that pictures are drawn for
 LARGEST = 1e9  # numbers of a client must be below this
@@ -228,7 +227,7 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
             return status, {**fields, **extra}, content
 
         def read(connection: Any) -> Any:
-            return handler(_Reader(connection, rules))
+            return handler(_Reader(connection, _rules=rules))
 
         return serve(read, host, port, process_request=answer, **options)
 
@@ -260,9 +259,6 @@ class _Overlay:
 
 class _Reader(_Overlay):
     """A connection that passes on only frames that are messages and that the rules admit."""
-
-    def __init__(self, connection: Any, rules: Rules) -> None:
-        super().__init__(connection, _rules=rules)
 
     async def recv(self, *args: Any, **kwargs: Any) -> Any:
         while True:

@@ -88,7 +88,6 @@ class AbcdPanel(ViewerControl):
             self._update()
 
     def __call__(self, event: events.Event) -> None:
-        """Take an event in."""
         if isinstance(event, events.WorkersSeen):
             self._workers = event.workers
         names = {events.LayersDrawn: "layers", events.Pruning: "final pruning"}
@@ -185,7 +184,6 @@ class AbcdPanel(ViewerControl):
         ]
 
     def _active(self) -> list[int]:
-        """The blocks in training."""
         state = self._coordinator.state
         if state.active is not None:
             return [] if state.active.is_whole else [state.active.geometry.block]
@@ -283,7 +281,6 @@ class Controls:
 
     @property
     def show(self) -> Show:
-        """What is to be drawn."""
         return Show(self._show.value)
 
     @property
@@ -292,7 +289,6 @@ class Controls:
         return None if self._block.value == FOLLOW else int(self._block.value) - 1
 
     def set_blocks(self, count: int) -> None:
-        """Offer that many blocks for choice."""
         names = tuple(str(block + 1) for block in range(count))
         self._block.options = (FOLLOW, *names) if self._trains else names
 

@@ -17,8 +17,7 @@ from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.guard import THIS_MACHINE
 
 MOST_ROWS = 24  # of the table of blocks; with more blocks those that are active or under-observed come first
-CONTAINER_MARKS = (Path("/.dockerenv"), Path("/run/.containerenv"))
-"""What docker and podman leave in their containers."""
+CONTAINER_MARKS = (Path("/.dockerenv"), Path("/run/.containerenv"))  # left by docker and podman
 FORWARD = 0.5  # time of drawing a picture, in steps, which draw it backward, too
 
 

@@ -6,32 +6,26 @@ import pytest
 from rich.console import Console
 
 from abcd_ns.lab.results.records import read_json, write_json
-from abcd_ns.lab.results.results import Arm
 from benchmarks import gpu
 from benchmarks.gpu import Args, main, show
-from tests.lab.compare.records import made_up, made_up_run
+from tests.lab.compare.records import made_up, made_up_arm
 from tests.reference.colmap_scene import write_scene
 
 GIB = 2**30
-WHOLE = {
-    "part": "build",
-    "dry_run": True,
-    "error": None,
-    "seconds": 1.0,
-    "found": {"hardware": {"gpu": "made up"}},
-}
+FOUND = {"hardware": {"gpu": "made up"}}
+WHOLE = {"part": "build", "dry_run": True, "error": None, "seconds": 1.0, "found": FOUND}
 
 
 def test_what_a_part_had_found_is_kept_if_it_breaks_off(tmp_path, monkeypatch):
     def breaks(_args, _work):
-        yield {"hardware": {"gpu": "made up"}}
+        yield FOUND
         raise KeyboardInterrupt
 
     monkeypatch.setitem(gpu.PARTS, "build", breaks)
     with pytest.raises(KeyboardInterrupt):
         main(Args(out=tmp_path, parts=("build",), dry_run=True))
     record = read_json(tmp_path / "build.json")
-    assert (record["error"], record["found"]) == ("unfinished", WHOLE["found"])
+    assert (record["error"], record["found"]) == ("unfinished", FOUND)
 
 
 def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkeypatch, capsys):
@@ -39,7 +33,7 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
 
     def note(_args, _work):
         ran.append("build")
-        yield WHOLE["found"]
+        yield FOUND
 
     monkeypatch.setitem(gpu.PARTS, "build", note)
     args = {"out": tmp_path, "dry_run": True, "parts": ("build",)}
@@ -57,12 +51,9 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
 
 def test_every_record_is_shown(tmp_path, capsys):
     memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
-    variants = {"splatfacto": "default", "abcd-monolithic": "default"}
-    arms = [*variants.items(), ("abcd", "blocks=1"), ("abcd", "blocks=8")]
-    arms = [
-        Arm(method, variant, None, (made_up_run(method, psnr=20.0 + k, **memory),))
-        for k, (method, variant) in enumerate(arms)
-    ]
+    joint = "splatfacto", "abcd-monolithic"
+    arms = [made_up_arm("default", None, {0: 20.0 + k}, method, **memory) for k, method in enumerate(joint)]
+    arms += [made_up_arm(f"blocks={n}", None, {0: 22.0 + n}, **memory) for n in (1, 8)]
     found = {"results": asdict(made_up("GPU comparison", *arms))}
     show([WHOLE, WHOLE | {"part": "compare", "found": found}], tmp_path, Console())
     names = {path.name for path in tmp_path.iterdir()}

@@ -9,13 +9,8 @@ from benchmarks import large
 
 
 def test_a_visit_is_counted(tmp_path, monkeypatch):
-    for owner, name in (
-        (ParameterStore, "load"),
-        (LayerRenderer, "load"),
-        (TorchRasterizer, "cuts"),
-        (visit_training, "layers_of_visit"),
-        (layer_source, "PARTS_BYTES"),
-    ):
+    methods = (ParameterStore, "load"), (LayerRenderer, "load"), (TorchRasterizer, "cuts")
+    for owner, name in (*methods, (visit_training, "layers_of_visit"), (layer_source, "PARTS_BYTES")):
         monkeypatch.setattr(owner, name, getattr(owner, name))  # is as it was afterwards
     args = large.Args(gaussians=40, views=4, visits=1, width=48)
     large.make(4, args, tmp_path / "store")

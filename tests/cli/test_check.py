@@ -136,13 +136,16 @@ def test_names_that_no_terminal_takes_are_escaped(scene, capsys):
     assert "over: right/\\udcff\\n00.png." in capsys.readouterr().out
 
 
-def test_the_readers_notes_are_warnings(tmp_path):
+def test_the_readers_notes_are_warnings_and_said_once(tmp_path, capsys):
     write_capture(tmp_path, points=0)
     for i in range(11):
         Image.new("RGB", (9, 9), (i, 90, 90)).save(tmp_path / f"images/extra{i}.png")
     said = [finding.what for finding in examine(tmp_path)[1] if finding.name == "input"]
     assert any("has no points" in line for line in said)
     assert any("Fewer than half have one" in line for line in said)
+    capsys.readouterr()
+    check(data=tmp_path)
+    assert " ".join(capsys.readouterr().out.split()).count("Fewer than half have one") == 1
 
 
 # What is doubtful: it is found where it is, and not where it is not
@@ -175,13 +178,6 @@ def changed(found: Survey, pose: Callable | None = None, points: np.ndarray | No
 
 def with_brightness(found: Survey, *brightness: float) -> Survey:
     return replace(found, looks=tuple(map(Look, brightness)))
-
-
-def test_few_photos_and_a_split_that_leaves_one(tmp_path):
-    write_capture(tmp_path, NAMES[:2], points=POINTS, params=wide)
-    (few,) = (finding for finding in examine(tmp_path)[1] if finding.name == "few-photos")
-    assert "2 photos, 1 of them to train on" in few.what
-    assert "eval-mode all" in few.fix
 
 
 def test_copies_of_a_photo_are_named_and_leaks_counted(scene):

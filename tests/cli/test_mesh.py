@@ -153,10 +153,6 @@ def run(tmp_path_factory) -> Path:
     return write_run(tmp_path_factory.mktemp("place"))
 
 
-def photos_of(run: Path) -> Path:
-    return run.parent / "wall"
-
-
 def read(path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     found = PlyData.read(str(path))
     vertices = found["vertex"].data
@@ -165,7 +161,7 @@ def read(path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_the_wall_is_in_the_datas_frame_and_another_reader_finds_it(run, tmp_path, capsys):
-    assert mesh(run, data=photos_of(run), out=tmp_path / "wall.ply") == 0
+    assert mesh(run, data=run.parent / "wall", out=tmp_path / "wall.ply") == 0
     position, color, faces = read(tmp_path / "wall.ply")
     assert np.abs(position[:, 2]).max() < 0.1
     assert np.ptp(position[:, 0]) > 4
@@ -179,7 +175,7 @@ def test_the_wall_is_in_the_datas_frame_and_another_reader_finds_it(run, tmp_pat
 
 
 def test_voxel_and_box_are_in_the_units_of_the_frame(run, tmp_path, capsys):
-    options = {"data": photos_of(run), "voxel": 0.15, "box": (0.0, -1.0, -1.0, 1.0, 1.0, 1.0)}
+    options = {"data": run.parent / "wall", "voxel": 0.15, "box": (0.0, -1.0, -1.0, 1.0, 1.0, 1.0)}
     assert mesh(run, out=tmp_path / "box.ply", **options) == 0
     assert "voxels of 0.15" in capsys.readouterr().out
     position, _, _ = read(tmp_path / "box.ply")
@@ -188,7 +184,7 @@ def test_voxel_and_box_are_in_the_units_of_the_frame(run, tmp_path, capsys):
 
 
 def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path, monkeypatch):
-    out, photos = tmp_path / "new.ply", photos_of(run)
+    out, photos = tmp_path / "new.ply", run.parent / "wall"
     for words, options in {
         "it must be above 0": {"voxel": -1.0},
         "no surface in this box": {"box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)},
@@ -205,4 +201,4 @@ def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path, monkeypatch
 def test_the_photos_of_another_run_are_refused(tmp_path):
     run = write_run(tmp_path, **MadeFor("0", [0.0, 0.0, 0.0], "in turn", 3, "3dgs").header())
     with pytest.raises(UserError, match="is not what the run was made for: photos 0, not "):
-        mesh(run, data=photos_of(run), out=tmp_path / "new.ply")
+        mesh(run, data=run.parent / "wall", out=tmp_path / "new.ply")

@@ -69,15 +69,13 @@ def test_no_help_begins_a_line_within_a_sentence():
     assert [line for line in lines if re.match(r" {6,}[a-z]", line)] == []
 
 
-def printed(*findings: Finding, width: int = 80) -> list[str]:
-    stream = io.StringIO()
-    print_findings(findings, Console(file=stream, width=width))
-    return stream.getvalue().splitlines()
-
-
 def test_groups_are_titled_and_long_ones_cut():
-    name, long = "[red]a.png[/red] :smile:", [Finding("note", str(i), "Too.") for i in range(30)]
-    lines = printed(Finding("note", "n", name), Finding("error", "e", "Bad."), *long)
+    name = "[red]a.png[/red] :smile:"
+    findings = [Finding("note", "n", name), Finding("error", "e", "Bad.")]
+    findings += [Finding("note", str(i), "Too.") for i in range(30)]
+    stream = io.StringIO()
+    print_findings(findings, Console(file=stream, width=80))
+    lines = stream.getvalue().splitlines()
     assert lines[:5] == ["", "error", "  e: Bad.", "", "notes (31)"]
     assert lines[5] == f"  n: {name}"  # names of files are no markup
     assert lines[24:] == ["  18: Too.", "  ... and 11 more (31 in all)."]
@@ -92,11 +90,7 @@ def names_in_code() -> set[str]:
     return {args[place[maker]].value for maker, args in calls if maker in place}
 
 
-def names_in_document() -> set[str]:
-    headings = re.findall(r"^#### (.+)$", DOCUMENT, re.MULTILINE)
-    return {name for heading in headings for name in heading.split(", ")}
-
-
 def test_the_document_explains_every_finding_and_no_other():
+    headings = re.findall(r"^#### (.+)$", DOCUMENT, re.MULTILINE)
     assert len(names_in_code()) > 30
-    assert names_in_document() == names_in_code()
+    assert {name for heading in headings for name in heading.split(", ")} == names_in_code()

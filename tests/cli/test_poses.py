@@ -99,18 +99,6 @@ def test_photos_that_show_nothing_are_refused_and_nothing_is_left(blank):
     assert os.listdir(blank.parent) == ["images"]
 
 
-def no_picture(photo: Path) -> None:
-    photo.write_bytes(b"no picture")
-
-
-def no_text(photo: Path) -> None:
-    photo.rename(photo.with_name(os.fsdecode(b"\xe9.png")))
-
-
-def not_of_colmaps(photo: Path) -> None:
-    photo.rename(photo.with_suffix(".webp"))
-
-
 def of_phones(photo: Path) -> None:
     photo.unlink()
     for name in ("a.HEIC", "b.HEIC", "c.CR2", "notes.txt"):
@@ -120,9 +108,9 @@ def of_phones(photo: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "options", "said"),
     [
-        (no_picture, {}, r"0\.png is not a picture"),
-        (no_text, {}, "is not UTF-8; rename it"),
-        (not_of_colmaps, {}, r"has 2 photos.* Not read: 1 \.webp; make JPEGs of them"),
+        (lambda photo: photo.write_bytes(b"no picture"), {}, r"0\.png is not a picture"),
+        (lambda photo: photo.rename(photo.with_name(os.fsdecode(b"\xe9.png"))), {}, "is not UTF-8; rename"),
+        (lambda photo: photo.rename(photo.with_suffix(".webp")), {}, r"has 2 photos.* 1 \.webp; make JPEGs"),
         (of_phones, {}, r"has 2 photos.* Not read: 1 \.CR2, 2 \.HEIC; .*jpg \*\.HEIC"),
         (Path.exists, {"lens": "EYE"}, "--lens EYE is none of the camera models"),
     ],

@@ -12,8 +12,6 @@ from abcd_ns.cli import train
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import own_configs
 
-CONFIGS = own_configs(trains=True)
-
 
 @pytest.fixture
 def told(monkeypatch):
@@ -34,7 +32,7 @@ def test_tables_become_dotted_names_and_later_words_count(tmp_path, told, capsys
     assert told == [["abcd", *options.split(), "--data", "garden"]]
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", own_configs(trains=True), ids=lambda path: path.stem)
 def test_ns_train_takes_every_file_in_configs(path):
     words = train.command_line(path)
     config = tyro.cli(AnnotatedBaseConfigUnion, args=[*words, "--pipeline.max-seconds", "77"])

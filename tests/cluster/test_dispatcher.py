@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from abcd_ns.cluster.assignment import Finished, Lost, StepsSeen, WorkersError
-from abcd_ns.cluster.dispatcher import LOSSES, Dispatcher
+from abcd_ns.cluster.dispatcher import LOSSES
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.commit import with_pending
@@ -50,6 +50,7 @@ class Unreliable(InProcessWorkers):
         return [*late, Lost(assignment.number, fate)]
 
 
+WARM_UP = {"density": STILL, "coarse_model": 40, "warmup": 0.3}
 HARMONICS = {"late_harmonics": 2, "block_limit": 30}
 """They come late, while blocks in their first visits still grow; workers keep to the room that they leave."""
 
@@ -58,7 +59,7 @@ HARMONICS = {"late_harmonics": 2, "block_limit": 30}
     "options",
     [
         {"density": GROWING},
-        {"density": STILL, "coarse_model": 40, "warmup": 0.3},
+        WARM_UP,
         {"density": replace(GROWING, refine_stop=0.2, min_contribution=0.0), **HARMONICS},
     ],
 )
@@ -67,7 +68,6 @@ def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos,
     alone, assigned = make("alone", **options), make("assigned", workers=1, lag=1, **options)
     train(alone, photos)
     train(assigned, photos)
-    assert isinstance(assigned, Dispatcher)
     assert alone.state.step == assigned.state.step == 60
     assert alone.state.sh_degree == 1
     assert equal(whole_scene(alone), whole_scene(assigned))
@@ -136,9 +136,8 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos):
             state = report.outcome.state
             noise = 0.3 * torch.randn(state.gaussians.means.shape, generator=generator)
             moved = replace(state.gaussians, means=state.gaussians.means + noise)
-            reports = [
-                Finished(report.assignment, replace(report.outcome, state=replace(state, gaussians=moved)))
-            ]
+            outcome = replace(report.outcome, state=replace(state, gaussians=moved))
+            reports = [Finished(report.assignment, outcome)]
         return reports
 
     run.workers.wait = wait
@@ -204,19 +203,16 @@ def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
 
 
 def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
-    run = make(workers=2, lag=2, density=STILL, coarse_model=40, warmup=0.3, light="affine")
+    run = make(workers=2, lag=2, light="affine", **WARM_UP)
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
     before = {view: run.run.light.of(view).detach() for view in run.views}
     assert any(bool((transform.diff(dim=-1) != 0).any()) for transform in before.values())
-    assigned = []
-    submit = run.workers.submit
+    assigned, submit = [], run.workers.submit
     run.workers.submit = lambda assignment: (assigned.append(assignment.task.light), submit(assignment))
     train(run, photos)
     assert assigned
-    assert all(
-        torch.equal(transform, before[view]) for light in assigned for view, transform in light.items()
-    )
+    assert all(torch.equal(found, before[view]) for light in assigned for view, found in light.items())
     assert all(torch.equal(run.run.light.of(view), before[view]) for view in before)
 
 
@@ -230,14 +226,7 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
         return run
 
     monkeypatch.setattr(VisitWorker, "_run_of", watched)
-    run = make(
-        workers=2,
-        density=STILL,
-        coarse_model=40,
-        warmup=0.3,
-        poses="SO3xR3",
-        target=partial(target_of, photos),
-    )
+    run = make(workers=2, poses="SO3xR3", target=partial(target_of, photos), **WARM_UP)
     given = {index: view.viewmat for index, view in run.views.items()}
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
@@ -250,12 +239,11 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
 
 
 def test_what_was_trained_here_leaves_the_device_before_anything_is_assigned(make, photos):
-    options = {"density": STILL, "coarse_model": 40, "warmup": 0.3}
-    alone = make("run", **options)
+    alone = make("run", **WARM_UP)
     train(alone, photos, steps=3)
     assert alone.state.active is not None
     stop(alone)
-    run = make("run", workers=2, resume=True, **options)
+    run = make("run", workers=2, resume=True, **WARM_UP)
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
     held, submit = [], run.workers.submit

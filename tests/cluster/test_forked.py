@@ -20,6 +20,7 @@ from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.errors import UserError
 from tests.cluster.conftest import GROWING, make_run, setup_of, target_of
 from tests.reference.scenes import equal, listen, whole_scene
+from tests.reference.store_helpers import wait_until
 
 pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
 
@@ -91,21 +92,14 @@ def test_a_visit_without_memory_or_a_word_is_assigned_again(
     assert equal(steady[0], whole_scene(run))
 
 
-def stand_still(pids) -> bool:
-    still = {psutil.STATUS_STOPPED, psutil.STATUS_ZOMBIE}
-    return {psutil.Process(pid).status() for pid in pids} <= still
-
-
 def test_while_time_is_paused_nobody_trains(make, photos, steady):
     run = make()
     while not run.workers.pids:
         train_step(run, photos)
     run.pause()
     before, pids = run.stopwatch.seconds, run.workers.pids
-    until = time.monotonic() + 20
-    while not stand_still(pids) and time.monotonic() < until:
-        time.sleep(0.01)
-    assert stand_still(pids)
+    still = {psutil.STATUS_STOPPED, psutil.STATUS_ZOMBIE}
+    wait_until(lambda: {psutil.Process(pid).status() for pid in pids} <= still)
     assert run.stopwatch.seconds == before
     train(run, photos)
     assert equal(steady[0], whole_scene(run))
@@ -199,7 +193,4 @@ def test_no_worker_outlives_the_training_process(make, held):
     assert all(map(psutil.pid_exists, pids))
     os.kill(driver, signal.SIGKILL)
     os.waitpid(driver, 0)
-    until = time.monotonic() + 20
-    while any(map(psutil.pid_exists, pids)) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not any(map(psutil.pid_exists, pids))
+    wait_until(lambda: not any(map(psutil.pid_exists, pids)))

@@ -8,6 +8,7 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -126,10 +127,7 @@ def test_workers_that_are_lost_take_nothing_along(steady, assigned, photos, trap
 
 
 def test_where_disk_is_full_too_one_line_says_so(assigned, photos, monkeypatch):
-    def put(_):
-        raise OutOfDiskError("no space left on device")
-
-    monkeypatch.setattr(ray_workers.ray, "put", put)
+    monkeypatch.setattr(ray_workers.ray, "put", Mock(side_effect=OutOfDiskError("no space left on device")))
     with pytest.raises(WorkersError, match=r"no room for a block: no space left.*--object-store-memory"):
         train(assigned, photos)
     assert assigned.state.step == 0
@@ -181,15 +179,9 @@ def test_a_stranger_without_the_token_is_refused():
     code = "import sys; from abcd_ns.cluster.connect import connect; connect(sys.argv[1], cores=1)"
     once = {"RAY_NUM_REDIS_GET_RETRIES": "1"}  # otherwise it tries 20 times, a second apart
     stranger = {**os.environ, **once, "RAY_AUTH_TOKEN": "0" * 64}
-    found = subprocess.run(
-        [sys.executable, "-c", code, address],
-        env=stranger,
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    command, folder = [sys.executable, "-c", code, address], Path(__file__).parents[2]
+    options = {"env": stranger, "cwd": folder, "timeout": 60, "check": False}
+    found = subprocess.run(command, capture_output=True, text=True, **options)
     assert found.returncode != 0
     assert "WorkersError: No Ray cluster answers" in found.stderr
 

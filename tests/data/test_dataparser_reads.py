@@ -23,7 +23,6 @@ from tests.data.dataparser_scenes import (
     refusal,
     save_transforms,
     write_capture,
-    write_model,
     write_photos,
     write_transforms,
 )
@@ -104,13 +103,6 @@ def test_a_sector_is_held_out_at_an_end_of_the_capture():
     assert sorted(train + held_out) == list(range(24))
     assert {len(held_out)} == {3}
     assert sorted(np.argsort(angles).argsort()[held_out]) in ([0, 1, 2], [21, 22, 23])
-
-
-@pytest.mark.parametrize("folder", ["sparse/0", "colmap/sparse/0", "sparse"])
-def test_model_is_found_without_a_flag(tmp_path, folder):
-    write_model(tmp_path / folder)
-    write_photos(tmp_path / "images")
-    assert len(parser(tmp_path).get_dataparser_outputs().image_filenames) == 8
 
 
 def test_zero_distortion_is_a_pinhole(tmp_path):

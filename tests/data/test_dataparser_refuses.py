@@ -102,8 +102,7 @@ def test_a_binary_model_that_is_cut_or_miscounts_is_refused(scene, file):
     assert "more than its entries" in refusal(scene)
     path.write_bytes(b"\xff" * 8 + whole[8:])
     assert "claims" in refusal(scene)
-    path.unlink()
-    os.mkfifo(path)
+    _fifo(path)
     assert "not a regular file" in refusal(scene)
 
 
@@ -249,6 +248,7 @@ def test_long_lists_are_cut_with_a_count():
         *(({"scale_factor": value}, "scale-factor is") for value in (0.0, -1.0, math.nan, math.inf)),
         ({"downscale_factor": 50}, "leaves nothing"),
         ({"eval_interval": 1}, "eval-interval"),
+        *(({"eval_mode": "fraction", "train_split_fraction": n}, "neither may be 0") for n in (0, 0.95, 1)),
     ],
 )
 def test_impossible_options_are_refused(scene, options, message):

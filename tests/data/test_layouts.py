@@ -138,11 +138,6 @@ def test_splits_in_different_worlds_are_refused(tmp_path):
     assert "need the same applied_transform" in refusal(data)
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0, 0.95])
-def test_a_split_by_a_share_leaves_something_on_either_side(scene, share):
-    assert "neither may be 0" in refusal(scene, eval_mode="fraction", train_split_fraction=share)
-
-
 # For other methods
 
 

@@ -15,6 +15,7 @@ from tests.data import dataparser_scenes
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
+    add_mask,
     parser,
     refusal,
     save_transforms,
@@ -119,6 +120,7 @@ def put_no_model(scene: Path) -> None:
         lambda scene: encode_transforms(scene, "utf-8-sig"),
         lambda scene: encode_transforms(scene, "utf-16"),
         put_no_model,
+        lambda scene: write_transforms(scene, lambda each: add_mask(scene, each, "{folder}/{stem}-mask.png")),
         lambda scene: (scene / "images").rename(scene / "Images"),
     ],
 )
@@ -150,8 +152,8 @@ def test_the_model_with_most_photos_is_taken_and_it_is_said(tmp_path, capsys):
     assert len(paths_of(tmp_path, colmap_path=Path("sparse/0"))) == 3
 
 
-@pytest.mark.parametrize("place", [".", "colmap"])
-def test_a_model_and_photos_flat_in_a_folder(tmp_path, place):
+@pytest.mark.parametrize("place", [".", "colmap", "colmap/sparse/0", "sparse"])
+def test_a_model_in_any_of_its_places_and_photos_flat_in_a_folder(tmp_path, place):
     write_capture(tmp_path / "made", text=True, names=["a b (1).png", "a b (2).png", "a b (3).png"])
     (tmp_path / "flat" / place).mkdir(parents=True)
     for part in (tmp_path / "made/sparse/0").glob("*.txt"):

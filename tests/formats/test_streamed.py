@@ -26,12 +26,8 @@ def weight(gaussians, row):
     return float(torch.exp(gaussians.scales[row].topk(2).values.sum()) * gaussians.opacities[row].sigmoid())
 
 
-def random(count, seed=0):
-    return random_gaussians(count, seed, sh_degree=2)
-
-
 def test_two_become_one_with_their_moments():
-    first, second = random(20, seed=1), random(20, seed=2)
+    first, second = (random_gaussians(20, seed, sh_degree=2) for seed in (1, 2))
     first, second = (replace(each, opacities=each.opacities.clamp_max(-2)) for each in (first, second))
     found = merged(first, second)
     for row in range(20):
@@ -50,7 +46,7 @@ def test_two_become_one_with_their_moments():
 
 
 def test_two_opaque_ones_in_one_place_become_a_wider_one():
-    one = replace(random(20), opacities=torch.full((20, 1), 9.0))
+    one = replace(random_gaussians(20, sh_degree=2), opacities=torch.full((20, 1), 9.0))
     found = merged(one, one)
     assert torch.allclose(found.opacities.sigmoid(), torch.tensor(MOST_OPAQUE))
     wider = found.scales.sort(dim=1).values - one.scales.sort(dim=1).values
@@ -58,7 +54,7 @@ def test_two_opaque_ones_in_one_place_become_a_wider_one():
 
 
 def test_pairs_take_each_row_once_and_leave_no_two_that_could_be_merged():
-    gaussians = random(300)
+    gaussians = random_gaussians(300, sh_degree=2)
     first, second = pairs(gaussians)
     rows = torch.cat([first, second]).tolist()
     assert len(rows) == len(set(rows))
@@ -69,9 +65,9 @@ def test_pairs_take_each_row_once_and_leave_no_two_that_could_be_merged():
 
 
 def test_few_stay_as_they_are():
-    one = random(1)
+    one = random_gaussians(1, sh_degree=2)
     assert torch.equal(coarser(one).means, one.means)
-    twice = coarser(coarser(random(2)))
+    twice = coarser(coarser(random_gaussians(2, sh_degree=2)))
     assert len(twice) == 1
 
 

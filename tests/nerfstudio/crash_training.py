@@ -60,3 +60,10 @@ def gaussians(run: Path) -> dict[str, torch.Tensor]:
     newest = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))[-1]
     state = torch.load(newest, weights_only=True)["pipeline"]
     return {name: value for name, value in state.items() if "gauss_params" in name}
+
+
+def assert_same(run: Path, other: Path) -> None:
+    """Two runs' last checkpoints hold the same scene, to the last bit."""
+    mine, theirs = gaussians(run), gaussians(other)
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)

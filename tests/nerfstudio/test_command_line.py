@@ -38,8 +38,7 @@ def test_train_then_evaluate(tmp_path):
 
 
 def test_an_option_that_is_none_here_is_one_line_before_nerfstudio_reads_any(monkeypatch, said_at_exit):
-    words = ["ns-train", "abcd", "--data", "x", "--pipeline.training.warmpu", "0.1"]
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "x", "--pipeline.training.warmpu", "0.1"])
     (line,) = said_at_exit(importlib.reload, methods).splitlines()  # as nerfstudio loads it
     assert line.startswith("error: There is no option --pipeline.training.warmpu; did you mean")
 

@@ -35,14 +35,10 @@ def discover_all() -> tuple[dict, str]:
     """What nerfstudio finds while something is missing, by what that is; and what is said on the terminal."""
     found = {name: discovered(name) for name in NEEDED}
     found["others"] = discovered(*NOT_NEEDED)
-    code, said = None, StringIO()
-    try:
-        with redirect_stdout(said):
-            found["fcntl"][0].print_to_terminal()
-    except SystemExit as end:
-        code = end.code
+    with pytest.raises(SystemExit) as end, redirect_stdout(StringIO()) as said:
+        found["fcntl"][0].print_to_terminal()
     kinds = {name: (type(config).__name__, *rest) for name, (config, *rest) in found.items()}
-    return {**kinds, "code": code}, said.getvalue()
+    return {**kinds, "code": end.value.code}, said.getvalue()
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Pictures of a scene that the device could not draw at once: node by node, and still the merged picture."""
 
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -26,23 +27,10 @@ def drawn(monkeypatch) -> list[int]:
     return counts
 
 
-def short_of_memory(monkeypatch, gaussians: int = 1) -> None:
-    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: gaussians)
-
-
 def pictures(pipeline) -> list[dict]:
     pipeline.eval()
     loader = pipeline.datamanager.fixed_indices_eval_dataloader
     return [pipeline.model.get_outputs_for_camera(camera) for camera, _ in loader]
-
-
-def assert_same_pictures(found: list[dict], expected: list[dict]) -> None:
-    assert len(found) == len(expected) > 0
-    for one, other in zip(found, expected, strict=True):
-        for name in ("rgb", "accumulation"):
-            assert float((one[name] - other[name]).abs().max()) < CLOSE, name
-        seen = other["accumulation"][..., 0] > 0.1
-        torch.testing.assert_close(one["depth"][seen], other["depth"][seen], rtol=1e-2, atol=1e-2)
 
 
 def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
@@ -50,10 +38,15 @@ def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     expected, count = pictures(pipeline), len(pipeline.model.means)
     assert set(drawn) == {count}
     drawn.clear()
-    short_of_memory(monkeypatch)
+    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: 1)
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     found = pictures(pipeline)
-    assert_same_pictures(found, expected)
+    assert len(found) == len(expected) > 0
+    for one, other in zip(found, expected, strict=True):
+        for name in ("rgb", "accumulation"):
+            assert float((one[name] - other[name]).abs().max()) < CLOSE, name
+        seen = other["accumulation"][..., 0] > 0.1
+        torch.testing.assert_close(one["depth"][seen], other["depth"][seen], rtol=1e-2, atol=1e-2)
     assert max(drawn) < count
     assert len(drawn) > len(expected)
 
@@ -63,20 +56,16 @@ def test_scores_take_a_share_of_the_training_time(trained, monkeypatch, capsys):
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     there, told = len(pipeline.datamanager.eval_dataset), []
     run = SimpleNamespace(seconds=0.0)
-    pipeline.coordinator = SimpleNamespace(
-        stopwatch=run, finished=False, pause=lambda: None, announce=told.append
-    )
-    looked_at, draw = [], pipeline.model.get_outputs_for_camera
-    monkeypatch.setattr(
-        pipeline.model, "get_outputs_for_camera", lambda *a, **k: (looked_at.append(1), draw(*a, **k))[1]
-    )
+    pipeline.coordinator = SimpleNamespace(stopwatch=run, pause=lambda: None, announce=told.append)
+    draw = Mock(side_effect=pipeline.model.get_outputs_for_camera)
+    monkeypatch.setattr(pipeline.model, "get_outputs_for_camera", draw)
     # Training seconds, of which a view takes 1; whether the run is complete; views.
     for seconds, finished, expected in ((1e6, False, there), (40.0, True, there), (40.0, False, 1)):
         pipeline._view_seconds, pipeline._scoring_seconds, run.seconds = 1.0, 0.0, seconds
         pipeline.coordinator.finished = finished
-        looked_at.clear()
+        draw.reset_mock()
         pipeline.get_average_eval_image_metrics()
-        assert len(looked_at) == expected
+        assert draw.call_count == expected
         assert ("held-out views" in capsys.readouterr().out) == (expected < there)
     assert len(told) == 3
     assert there == 2
@@ -87,7 +76,7 @@ def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):
     checkpoint = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     monkeypatch.setattr(AbcdModel, "device", torch.device("meta"))
-    short_of_memory(monkeypatch)
+    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: 1)
     pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
     model = pipeline.model
     assert {value.device.type for value in model.gauss_params.values()} == {"cpu"}

@@ -17,10 +17,8 @@ def test_a_corrected_psnr_leaves_the_light_of_the_photo_out():
 
 
 def test_hidden_pixels_are_not_scored():
-    photo, mask = (
-        torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)),
-        torch.ones(20, 30, 1).bool(),
-    )
+    photo = torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(20, 30, 1).bool()
     mask[:, 20:] = False
     picture = torch.where(mask, photo + 0.1, 0.0)
     found = image_metrics(picture, photo, mask=mask)

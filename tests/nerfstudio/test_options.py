@@ -24,15 +24,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.options import HIDDEN as HIDDEN_OF_MODEL
-from abcd_ns.nerfstudio.options import (
-    MIRRORED,
-    NO_FLAGS,
-    UNUSED_OF_MODEL,
-    check_options,
-    mirror,
-    refuse_flags,
-)
+from abcd_ns.nerfstudio.options import MIRRORED, NO_FLAGS, check_options, mirror, refuse_flags
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.run.begin import grid_counts
 from tests.nerfstudio.forks import forget, in_a_fork
@@ -203,11 +195,6 @@ def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, 
     with pytest.raises(UserError, match=rf"^{blocks} blocks make .* give fewer --pipeline.blocks"):
         grid_counts(means, blocks)
     assert math.prod(grid_counts(means, 1000)) >= 1000
-
-
-def test_every_option_of_splatfactos_model_is_a_flag_or_refused_by_a_reason():
-    for name in HIDDEN_OF_MODEL:
-        assert name in UNUSED_OF_MODEL or name in MIRRORED, name
 
 
 def test_any_reader_of_nerfstudios_is_named_as_with_splatfacto(capsys):

@@ -36,9 +36,8 @@ def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
     report(Pruning(2, 8))
     report._live.refresh()
     lines = [re.sub(r"\x1b\[[0-9?]*[a-zA-Z]", "", line) for line in re.split(r"[\r\n]", file.getvalue())]
-    assert any(
-        re.search(r"block 3/3 step 999/1000  \d:\d\d:\d\d left  20.00 dB training", line) for line in lines
-    )
+    live = r"block 3/3 step 999/1000  \d:\d\d:\d\d left  20.00 dB training"
+    assert any(re.search(live, line) for line in lines)
     assert any("final pruning 2/8" in line for line in lines)
     assert max(len(line.rstrip()) for line in lines) < 80
 

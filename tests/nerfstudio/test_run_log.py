@@ -8,6 +8,7 @@ from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -61,10 +62,8 @@ def trained(data, tmp_path_factory):
 
 
 def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch):
-    def full(*_) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(settings, "write_file", full)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(settings, "write_file", Mock(side_effect=full))
     with pytest.raises(UserError, match=r"No space left on device\): free space"):
         settings.write_settings(configure(tmp_path, tmp_path), {}, tmp_path)
 

@@ -4,6 +4,7 @@ import copy
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -162,10 +163,8 @@ def test_weights_are_fetched_when_that_is_allowed(trained, tmp_path, monkeypatch
     assert 0 < found["lpips"] < 1
     assert "lpips_missing" not in found
 
-    def fails(**_):
-        raise OSError("no route to host")
-
     monkeypatch.undo()
+    fails = Mock(side_effect=OSError("no route to host"))
     monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", fails)
     with pytest.raises(UserError, match="no route to host"):
         metrics._lpips("nowhere")
@@ -182,16 +181,15 @@ def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
 def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
     trained, rendered, monkeypatch, said_at_exit
 ):
-    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    config = trained.base_dir / "config.yml"
+    _, pipeline, _, _ = eval_setup(config)
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     straight = pipeline.model.view(camera)
     camera.camera_type = torch.full_like(camera.camera_type, CameraType.FISHEYE.value)
     with monkeypatch.context() as patched:
         patched.setattr("abcd_ns.viewer.pictures.asked_by_viewer", lambda: True)
         assert torch.equal(pipeline.model.view(camera).viewmat, straight.viewmat)
-    monkeypatch.setattr(
-        "sys.argv", ["ns-render", "camera-path", "--load-config", str(trained.base_dir / "config.yml")]
-    )
+    monkeypatch.setattr("sys.argv", ["ns-render", "camera-path", "--load-config", str(config)])
     assert "error: Camera 0 is fisheye" in said_at_exit(rendered, ["rgb"], camera_type="fisheye")
 
 

@@ -3,6 +3,7 @@
 import io
 import socket
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -186,11 +187,8 @@ def finished(watched, monkeypatch):
             super().__init__(config, *args, **kwargs)
             seen.extend((config, self))
 
-    def stop(_: float) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(run_viewer, "ViewerState", Seen)
-    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=stop))
+    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=Mock(side_effect=KeyboardInterrupt)))
     config = watched.trainer.base_dir / "config.yml"
     monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", str(config)])
     with pytest.raises(KeyboardInterrupt):
@@ -204,10 +202,8 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     assert ViewerConfig().websocket_host == "0.0.0.0"  # ns-viewer's own default
     assert config.websocket_host == "127.0.0.1"
     port = viewer.viser_server.get_port()
-    listening = [
-        c.laddr.ip for c in psutil.Process().net_connections() if c.laddr.port == port and not c.raddr
-    ]
-    assert set(listening) == {"127.0.0.1"}
+    sockets = psutil.Process().net_connections()
+    assert {c.laddr.ip for c in sockets if c.laddr.port == port and not c.raddr} == {"127.0.0.1"}
     assert rules_of(viewer.viser_server).host == "127.0.0.1"
     browser = Browser(viewer.viser_server)
     choices = browser.wait_for(lambda m: m.get("label") == "Block")

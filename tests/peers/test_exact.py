@@ -157,8 +157,7 @@ def test_views_of_a_step_may_differ_in_size(exact):
         coordinator = exact(kind.__name__, views=views, kind=kind, **options)
         train_step(coordinator, photos)
         coordinator.save()
-        state = coordinator.scene.state(0 if kind is ExactTrainer else ACTIVE)
-        counted.append(state.growth)
+        counted.append(coordinator.scene.state(0 if kind is ExactTrainer else ACTIVE).growth)
     exactly, jointly = counted
     assert torch.allclose(exactly["worth"], jointly["worth"], rtol=1e-3, atol=1e-4)
     assert float(jointly["worth"][:, :24].abs().max()) > 0

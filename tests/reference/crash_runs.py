@@ -45,10 +45,7 @@ class Kill:
 
 
 def run(
-    folder: Path,
-    kill: Kill | None = None,
-    file_bytes: int | None = None,
-    commit_seconds: float = 0.0,
+    folder: Path, kill: Kill | None = None, file_bytes: int | None = None, commit_seconds: float = 0.0
 ) -> None:
     """Train from where `folder` stands to the end; the body of a process.
 

@@ -31,9 +31,8 @@ class Counts:
     def since(self, earlier: "Counts") -> "Counts":
         """What came after `earlier`; of the bytes that are there, this moment's."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        less = {
-            n: v - getattr(earlier, n) for n, v in values.items() if n not in ("live_bytes", "peak_bytes")
-        }
+        counted = values.keys() - {"live_bytes", "peak_bytes"}
+        less = {name: values[name] - getattr(earlier, name) for name in counted}
         return Counts(**{**values, **less})
 
     def reset_peak(self) -> None:

@@ -85,16 +85,12 @@ def stands_in(**fixed: Any) -> Callable[[Callable], Callable]:
 
 
 def place_surfels(
-    tensors: Sequence[Tensor], width: int, height: int, near_plane: float, far_plane: float
+    means, quats, scales, viewmat, K, *, width: int, height: int, near_plane: float, far_plane: float
 ) -> list[Tensor]:
     """(radii, means2d, depths, ray_transforms, normals) of one camera: gsplat's own reference, but for radii.
 
     That has no least radius, as the kernel does, and none where a disc crosses the camera's plane.
-
-    Args:
-        tensors: means, quats, scales, viewmat, K.
     """
-    means, quats, scales, viewmat, K = tensors
     found = _fully_fused_projection_2dgs(means, quats, scales, viewmat[None], K[None], width, height)
     _, means2d, depths, rays, normals = (value[0] for value in found)
     rays = rays.transpose(1, 2)  # the kernel has rows for x, y and w
@@ -154,8 +150,8 @@ def fully_fused_projection_2dgs(
     """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
     CUDA, cameras get no gradient."""
 
-    def place(*tensors: Tensor) -> list[Tensor]:
-        return place_surfels(tensors, width, height, near_plane, far_plane)
+    options = {"width": width, "height": height, "near_plane": near_plane, "far_plane": far_plane}
+    place = functools.partial(place_surfels, **options)
 
     def _place(*tensors: Tensor) -> list[Tensor]:
         return by_camera(place, tensors[:3], *tensors[3:])
@@ -280,20 +276,15 @@ def rasterize_to_pixels_2dgs(ray_transforms, normals, densify, **given) -> tuple
     return (*rasterize_to_pixels(conics=ray_transforms, packed=True, **given), None, None, None)
 
 
-def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """Which tiles have a pixel in the image: [rows, cols]."""
-    width, height, side = size
-    rows, cols = (torch.arange(count) * side for count in offsets.shape[1:])
-    return (rows < height)[:, None] & (cols < width)
-
-
 def _drawn_lists(
     offsets: Tensor, flatten_ids: Tensor, masks: Tensor, size: tuple[int, int, int]
 ) -> tuple[Tensor, Tensor]:
     """The same lists, but for tiles that are masked or have no pixel in the image: these draw nothing."""
+    width, height, side = size
+    rows, cols = (torch.arange(count) * side for count in offsets.shape[1:])
     counts = torch.cat((offsets.flatten(), torch.tensor([len(flatten_ids)]))).diff()
     assert bool((counts >= 0).all())
-    drawn = (masks & _in_image(offsets, size)).flatten()
+    drawn = (masks & (rows < height)[:, None] & (cols < width)).flatten()
     first = int(offsets.flatten()[0])
     kept = flatten_ids[first:][torch.repeat_interleave(drawn, counts)]
     counts = counts * drawn

@@ -7,7 +7,7 @@ writes that file anew: where a change is meant to change what is learnt, and say
 
 import json
 import tempfile
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -31,11 +31,9 @@ OFTEN = {"refine_start": 0.1, "refine_every": 8, "split_pixels": 1.0}
 def options_of(method: str) -> dict:
     """What makes a method, by the options' own names."""
     training: TrainingConfig = getattr(methods, method).config.pipeline.training
-    default = TrainingConfig()
-    own = [f.name for f in fields(training) if f.name not in ("recipe", "limits", "density")]
-    changed = {
-        name: getattr(training, name) for name in own if getattr(training, name) != getattr(default, name)
-    }
+    values, default = vars(training), vars(TrainingConfig())
+    own = values.keys() - {"recipe", "limits", "density"}
+    changed = {name: values[name] for name in own if values[name] != default[name]}
     changed["density"] = replace(training.density, **OFTEN)
     recipe = {**asdict(training.recipe), "passes": 4}
     return {**changed, **recipe, "visit_steps": 5 * (training.recipe.visit_steps > 0)}
@@ -55,9 +53,8 @@ def curve_of(method: str, folder: Path) -> dict[str, list[float]]:
     blocks = 1 if method == "abcd_monolithic" else BLOCKS
     if blocks > 1 and options.get("warmup", 1) > 0:
         options["coarse_model"] = COARSE_MODEL
-    trainer = make_coordinator(
-        folder, start, views, blocks=blocks, steps=STEPS, kind=kind, content=content, **options
-    )
+    options |= {"blocks": blocks, "steps": STEPS, "kind": kind, "content": content}
+    trainer = make_coordinator(folder, start, views, **options)
     found: dict[str, list[float]] = {"psnr": [], "gaussians": []}
 
     def note(event: Event) -> None:

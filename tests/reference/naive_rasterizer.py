@@ -37,11 +37,8 @@ def sh_color(dc: Tensor, rest: Tensor, direction: Tensor, degree: int) -> Tensor
     x, y, z = direction / direction.norm()
     bases = [
         *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
-        *(
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * z * z - x * x - y * y),
-        ),
+        *(1.0925484305920792 * x * y, -1.0925484305920792 * y * z),
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
         *(-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)),
         -0.5900435899266435 * y * (3 * x * x - y * y),
         2.890611442640554 * x * y * z,
@@ -78,9 +75,7 @@ def _project(g: Gaussians, i: int, mean: Tensor, mean_c: Tensor, view: View, ant
     tx = z * torch.clamp(x / z, -(cx / fx + pad_x), (view.width - cx) / fx + pad_x)
     ty = z * torch.clamp(y / z, -(cy / fy + pad_y), (view.height - cy) / fy + pad_y)
     zero = torch.zeros_like(z)
-    J = torch.stack(
-        [torch.stack([fx / z, zero, -fx * tx / z**2]), torch.stack([zero, fy / z, -fy * ty / z**2])]
-    )
+    J = torch.stack([fx / z, zero, -fx * tx / z**2, zero, fy / z, -fy * ty / z**2]).view(2, 3)
     axes = rotation(g.quats[i]) @ torch.diag(g.scales[i].exp())
     R = view.viewmat[:3, :3]
     sharp = J @ R @ axes @ axes.T @ R.T @ J.T
@@ -201,10 +196,5 @@ def naive_rasterize(
             )
             pixels.append(_pixel(drawable, crop.x + col, crop.y + row, low, high))
     color, T, depth = (torch.stack([p[k] for p in pixels]) for k in range(3))
-    return NaiveRaster(
-        color.view(crop.height, crop.width, 3),
-        T.view(crop.height, crop.width),
-        depth.view(crop.height, crop.width),
-        means2d,
-        [0 if s is None else s.radius for s in own],
-    )
+    size, radii = (crop.height, crop.width), [0 if s is None else s.radius for s in own]
+    return NaiveRaster(color.view(*size, 3), T.view(size), depth.view(size), means2d, radii)

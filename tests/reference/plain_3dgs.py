@@ -21,9 +21,7 @@ def train_plain(
 ) -> Gaussians:
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
-    adam = {
-        name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
-    }
+    adam = {n: Adam([params[n]], lr=LEARNING_RATES[n], eps=1e-15, fused=True) for n in PARAM_NAMES}
     draw, density, growth, refined = TorchRasterizer(), DensityControl(config.density), {}, 0
     for taken in range(steps):
         row = endless_order(tuple(range(len(views))), taken, config.seed)
@@ -32,21 +30,13 @@ def train_plain(
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.recipe.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share
-        raster = draw(
-            Gaussians(**{name: params[name] for name in PARAM_NAMES}),
-            view,
-            sh_degree=degree,
-            residual_sums=True,
-        )
+        active = Gaussians(**{name: params[name] for name in PARAM_NAMES})
+        raster = draw(active, view, sh_degree=degree, residual_sums=True)
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
         picture = torch.addcmul(raster.color, raster.transmittance[..., None], background).clamp(0, 1)
-        loss = photometric_loss(
-            picture,
-            photos.images[row],
-            full_pixels=view.width * view.height,
-            full_windows=(view.width - 10) * (view.height - 10),
-        )
+        pixels, windows = view.width * view.height, (view.width - 10) * (view.height - 10)
+        loss = photometric_loss(picture, photos.images[row], full_pixels=pixels, full_windows=windows)
         for optimizer in adam.values():
             optimizer.zero_grad()
         residual = (photos.images[row] - picture).detach()

@@ -68,9 +68,8 @@ def as_leaves(gaussians: Gaussians) -> Gaussians:
 
 def probe(height: int, width: int, seed: int = 5, dtype: torch.dtype = torch.float64) -> Tensor:
     """Random weights [h, w, 5] for colour, transmittance and depth."""
-    return torch.randn(
-        height, width, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
-    ).to(dtype)
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(height, width, 5, generator=generator, dtype=torch.float64).to(dtype)
 
 
 def stacked(raster) -> Tensor:
@@ -82,11 +81,10 @@ def gradients(draw: Callable[[Gaussians], object], gaussians: Gaussians) -> tupl
     """(stacked image, gradients by name) of a random weighting of all outputs of `draw`."""
     leaves = as_leaves(gaussians)
     image = stacked(draw(leaves))
-    (image * probe(*image.shape[:2], dtype=image.dtype).to(image.device)).sum().backward()
-    grads = {name: getattr(leaves, name).grad for name in PARAM_NAMES}
-    return image.detach(), {
-        n: torch.zeros_like(getattr(leaves, n)) if g is None else g for n, g in grads.items()
-    }
+    loss = (image * probe(*image.shape[:2], dtype=image.dtype).to(image.device)).sum()
+    values = [getattr(leaves, name) for name in PARAM_NAMES]
+    grads = torch.autograd.grad(loss, values, materialize_grads=True)
+    return image.detach(), dict(zip(PARAM_NAMES, grads, strict=True))
 
 
 def assert_drawn_alike(

@@ -19,7 +19,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import pack_points, stored_blocks
-from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.scene import MemoryScene, StoredScene
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -68,11 +68,22 @@ def ring_of_views(
     views = []
     for index in range(count):
         angle = 2 * math.pi * index / count
-        eye = torch.tensor(
-            [radius * math.cos(angle), radius * math.sin(angle), 0.6 * (index % 3)], dtype=dtype
-        )
+        x, y = radius * math.cos(angle), radius * math.sin(angle)
+        eye = torch.tensor([x, y, 0.6 * (index % 3)], dtype=dtype)
         views.append(View(look_at(eye, torch.zeros(3, dtype=dtype)), K, width, height, index))
     return views
+
+
+class WatchedScene(MemoryScene):
+    """Notes the blocks that are read to be drawn."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.read: list[int] = []
+
+    def drawn(self, block: int, *given: Any) -> Gaussians:
+        self.read.append(block)
+        return super().drawn(block, *given)
 
 
 class Photos:
@@ -131,15 +142,9 @@ def make_coordinator(
             deferred = {DEFERRED: pack_points(PointCloud(*fields))}
         store.commit({**deferred, **dict(content(tree, gaussians))})  # at once: this may be killed
     config = training_config(sh_degree=gaussians.sh_degree, **training)
-    run = TrainingRun(
-        config,
-        Budget(steps=steps),
-        StoredScene(tree, store, ram_bytes),
-        views,
-        rasterizer or TorchRasterizer(primitive=config.primitive),
-        *nothing_active(gaussians.sh_degree, device),
-        device=device,
-    )
+    scene, active = StoredScene(tree, store, ram_bytes), nothing_active(gaussians.sh_degree, device)
+    draws = rasterizer or TorchRasterizer(primitive=config.primitive)
+    run = TrainingRun(config, Budget(steps=steps), scene, views, draws, *active, device=device)
     room = LayerRoom(layer_bytes, layer_ram_bytes)
     coordinator = kind(run) if kind else Coordinator(run, room=room, target=target)
     if resume:

@@ -204,7 +204,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if not here and not _is_device(kwargs.get("device")):
         return func(*args, **kwargs)
     _check_places(func, tensors, here)
-    _check_generator(kwargs.get("generator"))
+    if (generator := kwargs.get("generator")) is not None:
+        raise RuntimeError(
+            f"Expected a '{DEVICE.type}' device type for generator but found '{generator.device}'"
+        )
     if _waits(name, args, kwargs):
         _counts.wait(name)
     if kwargs.get("device") is not None:
@@ -248,13 +251,6 @@ def _check_places(func: Any, tensors: list[Tensor], here: list[OnDevice]) -> Non
         elif x.dim() > 0 or not takes_scalars:
             shapes = [(str(t.device), tuple(t.shape)) for t in tensors]
             raise RuntimeError(f"Expected all tensors to be on the same device: aten::{name} of {shapes}")
-
-
-def _check_generator(generator: torch.Generator | None) -> None:
-    if generator is not None:
-        raise RuntimeError(
-            f"Expected a '{DEVICE.type}' device type for generator but found '{generator.device}'"
-        )
 
 
 def _waits(name: str, args: Any, kwargs: dict[str, Any]) -> bool:
@@ -324,12 +320,9 @@ def _copy_from(source: Tensor, target: Tensor, non_blocking: bool = False) -> Te
     return target
 
 
-for _name, _function in (
-    ("empty.memory_format", _empty),
-    ("empty_strided", _empty_strided),
-    ("_copy_from", _copy_from),
-):
-    _library.impl(_name, _function, "PrivateUse1")
+_library.impl("empty.memory_format", _empty, "PrivateUse1")
+_library.impl("empty_strided", _empty_strided, "PrivateUse1")
+_library.impl("_copy_from", _copy_from, "PrivateUse1")
 
 
 class _Dispatch(TorchDispatchMode):

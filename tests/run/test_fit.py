@@ -85,10 +85,8 @@ def test_large_photos_are_trained_on_by_parts(gb, pixels, whole):
 @pytest.mark.parametrize("points", [140_000, 3_000_000])
 @pytest.mark.parametrize("pixels", [PIXELS, 2 * MP, 12 * MP, GARDEN])
 def test_with_more_memory_no_less_is_drawn(pixels, points):
-    drawn = []
-    for gb in (8, 10, 12, 16, 24, 40, 60, 80):
-        fit = fit_for(gb, pixels, points)
-        drawn.append(min(fit.limits.crop_pixels or pixels, pixels))
+    crops = [fit_for(gb, pixels, points).limits.crop_pixels for gb in (8, 10, 12, 16, 24, 40, 60, 80)]
+    drawn = [min(crop or pixels, pixels) for crop in crops]
     assert drawn == sorted(drawn)
     assert drawn[-1] == pixels
 
@@ -146,6 +144,7 @@ def test_a_cpu_keeps_layers_and_photos_under_another_budget():
 def test_what_is_set_is_kept():
     assert fit_for(80, 2 * MP, crop_pixels=5000).limits.crop_pixels == 5000
     assert fit_for(80, 2 * MP, batch_limit=2).limits.batch_limit == 2
+    assert coarse_model_size(training_config(coarse_gaussians=500), 3_333, PIXELS) == 500
 
 
 def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
@@ -165,14 +164,7 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
     visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))  # forced blocks: all at once
     assert peak_of(warm_up, size) <= peak_of(visit, block) < peak_of(warm_up, size + 1)
     assert size > block
-
-
-@pytest.mark.parametrize(
-    ("fitted", "size"),
-    [({"coarse_gaussians": 500}, 500), ({"batch": 1}, 3_333), ({"batch": 1, "crop_pixels": 900}, 3_333)],
-)
-def test_the_warm_up_has_the_size_that_is_asked_for_and_with_one_view_in_a_step_a_blocks(fitted, size):
-    assert coarse_model_size(training_config(**fitted), 3_333, PIXELS) == size
+    assert coarse_model_size(training_config(batch=1, crop_pixels=900), block, pixels) == block
 
 
 def test_what_a_scene_may_become_is_no_reason_to_cut_it_now():

@@ -17,8 +17,7 @@ from abcd_ns.peers.independent import independent_blocks, independent_trainer
 from tests.reference.scenes import STILL, listen, stop, whole_scene
 from tests.reference.simulated_device import DEVICE
 
-OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
-GROWING = DensityConfig(**OFTEN, split_pixels=0.0)
+GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=3, split_pixels=0.0)
 
 
 @pytest.fixture

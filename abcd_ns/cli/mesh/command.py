@@ -68,8 +68,7 @@ def mesh(
         with replacing(out) as partly:
             write_ply(partly, replace(surface, vertices=vertices))
     size, faces = bytes_in_words(out.stat().st_size), len(surface.faces)
-    said = f"{len(vertices):,} vertices, {faces:,} faces, {size}, voxels of {side * to.scale:.3g}"
-    print(f"{out}: {said}")
+    print(f"{out}: {len(vertices):,} vertices, {faces:,} faces, {size}, voxels of {side * to.scale:.3g}")
     tell_rounding(".ply", float(np.abs(vertices).max()), float(np.ptp(vertices, axis=0).max()))
     return 0
 

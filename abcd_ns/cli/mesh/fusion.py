@@ -75,7 +75,6 @@ class Fusion:
             self._seen.append(found)
         self._boxes = np.unique(np.concatenate([none, *self._seen]), axis=0)
         self.parts = max(1, -(-len(self._boxes) // part_boxes))
-        """In how many parts space is fused."""
         self._tree = build_kd(self._centers(self._boxes), self.parts)
 
     def pieces(self) -> Iterator[Piece]:

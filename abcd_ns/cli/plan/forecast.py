@@ -68,13 +68,11 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
         options = methods.abcd.config.pipeline
         seeds = dataset.metadata.get("points3D_xyz"), dataset.metadata.get("points3D_rgb")
         views = training_views(dataset.cameras, seeds[0])
-        factor = manager.dataparser.factor
         if seeds[0] is None:  # as training begins then
-            return Capture(
-                *random_points(options.model.num_random, options.model.random_scale), views, factor
-            )
-        seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
-        return Capture(*seeds, views, factor)
+            seeds = random_points(options.model.num_random, options.model.random_scale)
+        else:
+            seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
+        return Capture(*seeds, views, manager.dataparser.factor)
 
 
 @dataclass(frozen=True)
@@ -148,8 +146,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     demand = Demand(pixels, len(points), training, factor=capture.factor, on_cpu=on_cpu)
     fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted)
     training = replace(training, limits=fit.limits)
-    tree = build_kd(points, fit.blocks)
-    owner = tree.assign(points)
+    owner = build_kd(points, fit.blocks).assign(points)
     counts = owner.bincount(minlength=fit.blocks)
     batch = views_per_step(training.batch, fit.blocks)
     needs = needs_of(training, pixels, fit.blocks)
@@ -240,8 +237,7 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
         began = clock()
         crops = [part_to_draw(training, view.full, step, place) for place, view in enumerate(views)]
         samples = [Sample(*drawn, None, None, black) for drawn in zip(views, crops, strict=True)]
-        shots = [sample.shot for sample in samples]
-        rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
+        rasters = rasterizer.draw(leaves, [sample.shot for sample in samples], sh_degree=training.sh_degree)
         losses = [
             sample.loss(raster.color, torch.zeros_like(raster.color), training)
             for sample, raster in zip(samples, rasters, strict=True)

@@ -53,8 +53,7 @@ def report(
     if data is not None and found.checkpoint is not None:
         try:
             pipeline = load_pipeline(found, data)
-            sets = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
-            cameras = [each.cameras for each in sets]
+            cameras = [pipeline.datamanager.train_dataset.cameras, pipeline.datamanager.eval_dataset.cameras]
             held_out = look_at_held_out(pipeline, pictures)
         except UserError as error:  # photos may go missing until they are read
             notes.append(f"Held-out views could not be drawn. {error}")

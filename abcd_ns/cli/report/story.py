@@ -32,11 +32,9 @@ class Story:
     """Their number, as far as is known: one that is split off during a run has the next number."""
 
     def of(self, kind: type[L]) -> tuple[L, ...]:
-        """The lines of a kind."""
         return tuple(line for line in self.lines if isinstance(line, kind))
 
     def last(self, kind: type[L]) -> L | None:
-        """The last line of a kind, if there is one."""
         return next(reversed(self.of(kind)), None)
 
     @property
@@ -62,8 +60,7 @@ class Story:
     @property
     def gaussians(self) -> int:
         """In the whole scene, when last counted."""
-        known = self.last(EndLine) or self.last(SampleLine) or self.last(TrainingLine)
-        return known.gaussians
+        return (self.last(EndLine) or self.last(SampleLine) or self.last(TrainingLine)).gaussians
 
     def of_block(self, block: int) -> tuple[VisitEndLine, ...]:
         """The visits to one block that ended."""

@@ -1,7 +1,7 @@
 """All that belongs to one block, and how it is kept: Gaussians, Adam moments, growth statistics, clocks."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -40,7 +40,6 @@ class Packed(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all tensors."""
         return sum(value.nbytes for value in self.tensors.values())
 
     def gaussians(self, before: str = "", device: torch.device | str = "cpu") -> Gaussians:
@@ -61,20 +60,6 @@ class Packed(NamedTuple):
     def part(self, names: set[str]) -> "Packed":
         """Some columns."""
         return Packed({name: value for name, value in self.tensors.items() if name in names}, self.meta)
-
-
-def pack(parts: Mapping[str, Gaussians]) -> Packed:
-    """Gaussians, by "", and what else is shaped as they are, by what is set before the names."""
-    degrees = degrees_in_use([part.features_rest for part in parts.values()])
-    coefficients = parts[""].features_rest.shape[1]
-    kept = up_to_degree(degrees, coefficients)
-    tensors = {
-        before + name: value[kept] if name == "features_rest" else value
-        for before, part in parts.items()
-        for name, value in part.items()
-    }
-    parameters = sum(tensors[name].numel() for name in PARAM_NAMES)
-    return Packed({**tensors, DEGREES: degrees}, {"coefficients": coefficients, "parameters": parameters})
 
 
 @dataclass(frozen=True)
@@ -141,33 +126,34 @@ class BlockState:
         growth = {name: change(value) for name, value in self.growth.items()}
         return BlockState(gaussians, *moments, growth, self.clocks, change(self.deferred))
 
-    def forgetful(self) -> "BlockState":
-        """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
-        return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_views=0))
-
     def of_degree(self, sh_degree: int) -> "BlockState":
         """See `Gaussians.of_degree`."""
         moments = {name: getattr(self, name).of_degree(sh_degree) for name in MOMENTS}
         return replace(self, gaussians=self.gaussians.of_degree(sh_degree), **moments)
 
     def to(self, device: torch.device | str) -> "BlockState":
-        """On another device."""
         return self._each(lambda part: part.to(device))
 
     def unpinned(self) -> "BlockState":
         """Out of pinned memory, into which a GPU copies."""
-        if not self.gaussians.means.is_pinned():
-            return self
-        return self[torch.arange(len(self))]
+        return self[torch.arange(len(self))] if self.gaussians.means.is_pinned() else self
 
     def packed(self) -> Packed:
         """As it is kept, for the store; clocks as JSON."""
         parts = {"": self.gaussians, **{f"{moment}.": getattr(self, moment) for moment in MOMENTS}}
-        tensors, known = pack(parts)
-        growth = {f"growth.{name}": value for name, value in self.growth.items()}
-        return Packed(
-            {**tensors, IS_DEFERRED: self.deferred, **growth}, {"clocks": vars(self.clocks), **known}
-        )
+        degrees = degrees_in_use([part.features_rest for part in parts.values()])
+        coefficients = self.gaussians.features_rest.shape[1]
+        kept = up_to_degree(degrees, coefficients)
+        tensors = {
+            before + name: value[kept] if name == "features_rest" else value
+            for before, part in parts.items()
+            for name, value in part.items()
+        }
+        parameters = sum(tensors[name].numel() for name in PARAM_NAMES)
+        tensors |= {DEGREES: degrees, IS_DEFERRED: self.deferred}
+        tensors |= {f"growth.{name}": value for name, value in self.growth.items()}
+        meta = {"clocks": vars(self.clocks), "coefficients": coefficients, "parameters": parameters}
+        return Packed(tensors, meta)
 
     @staticmethod
     def unpacked(packed: Packed) -> "BlockState":

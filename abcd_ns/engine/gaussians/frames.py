@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.spherical_harmonics import sh_basis_rows, sh_degree_of
+from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE, sh_basis_rows
 from abcd_ns.engine.types import Gaussians
 
 DIRECTIONS = 64
@@ -33,7 +33,6 @@ class Frame:
 
     @property
     def inverse(self) -> "Frame":
-        """The way back."""
         turned = self.rotation.T @ self.translation
         return Frame(self.rotation.T, -self.scale * turned, 1 / self.scale)
 
@@ -69,18 +68,14 @@ def sh_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "15 15"]:
     """
     generator = torch.Generator().manual_seed(0)
     directions = F.normalize(torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64), dim=1)
-    before, after = _basis(directions), _basis(directions @ rotation.double().T)
-    degrees = torch.tensor([sh_degree_of(basis) for basis in range(before.shape[1])])
+    turned = directions @ rotation.double().T
+    before, after = (torch.stack(sh_basis_rows(*d.unbind(1)), dim=1) for d in (directions, turned))
     turn = before.new_zeros(before.shape[1], before.shape[1])
-    for degree in degrees.unique():
-        members = (degrees == degree).nonzero()[:, 0]
+    for degree in range(1, MAX_SH_DEGREE + 1):
+        members = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
         fit = torch.linalg.lstsq(before[:, members], after[:, members]).solution
-        turn[members[:, None], members] = fit.T
+        turn[members, members] = fit.T
     return turn
-
-
-def _basis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 15"]:
-    return torch.stack(sh_basis_rows(*directions.unbind(1)), dim=1)
 
 
 def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:

@@ -45,7 +45,6 @@ class PointCloud:
         return len(self.means)
 
     def __getitem__(self, rows: Tensor | slice) -> "PointCloud":
-        """The points at `rows`."""
         return replace(self, **{name: value[rows] for name, value in self.tensors.items()})
 
     @property

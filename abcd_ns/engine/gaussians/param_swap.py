@@ -114,11 +114,8 @@ def active_gaussians(params: Params) -> Gaussians:
     return Gaussians(**{name: params[name] for name in PARAM_NAMES})
 
 
-def nothing_active(
-    sh_degree: int, device: torch.device | str = "cpu"
-) -> tuple[dict[str, Parameter], Optimizers]:
-    """Empty parameters and one Adam for each, as 3DGS uses it: for a coordinator that nerfstudio does not
-    call."""
+def nothing_active(sh_degree: int, device: torch.device | str = "cpu") -> tuple[Params, Optimizers]:
+    """Empty parameters and one Adam for each, as 3DGS uses it, for a run without nerfstudio."""
     empty = Gaussians.empty(sh_degree, device)
     params = {name: Parameter(value) for name, value in empty.items()}
     optimizers = {

@@ -92,7 +92,6 @@ class Coordinator(Trainer):
         return self.state.active is None and super().finished
 
     def begin_visit(self) -> None:
-        """Begin the next one."""
         self._attach(self.visits.begin())
 
     def _attach(self, active: ActiveVisit) -> None:
@@ -153,10 +152,8 @@ class Coordinator(Trainer):
         run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
         block = None if active.is_whole else active.geometry.block
         staying = len(state) if block is None else len(updates[block])
-        migrated, seconds = len(state) - staying, run.stopwatch.seconds - active.began
-        run.announce(
-            VisitEnded(active.number, epoch, block, staying, migrated, active.layer_seconds, seconds)
-        )
+        migrated, took = len(state) - staying, run.stopwatch.seconds - active.began
+        run.announce(VisitEnded(active.number, epoch, block, staying, migrated, active.layer_seconds, took))
 
     def persist(self, within: float) -> None:
         """Persist the active block under a name of its own, and the run's state."""

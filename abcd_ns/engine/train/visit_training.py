@@ -116,7 +116,6 @@ class VisitTraining:
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """As Trainer.after_step: grows and prunes."""
         run, active = self.run, self.run.active
-        taken = len(rendered.views)
         self._adapt_light(rendered)
         self._note_influence(rendered)
         run.state.step += 1
@@ -124,7 +123,7 @@ class VisitTraining:
         sound, psnr = run.health.end_step(errors)
         judged = self._residuals.found()
         infos, judged = (rendered.infos, judged) if sound else ((), ())
-        clock = self.block.after_step(taken, self.batch, self._visits.room(), infos, judged)
+        clock = self.block.after_step(len(rendered.views), self.batch, self._visits.room(), infos, judged)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.block.prune()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))

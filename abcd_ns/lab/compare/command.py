@@ -87,7 +87,6 @@ class Options:
 
     @property
     def given(self) -> dict[str, Any]:
-        """Those that were given, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def over(self, other: "Options") -> "Options":

@@ -72,14 +72,13 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
     UserError, which begins with `where`, about what does not fit."""
     known, more = option_names(config), flat_options(config)
     for path, value in values.items():
-        if path not in known and path not in more:
+        if path in known:
+            try:
+                _set(config, path, read_value(path, str(value), known))
+            except UserError as error:
+                raise UserError(f"{where}: {error}") from None
+        elif path not in more:
             raise UserError(f"{where}: there is no option {path!r} in this version of abcd_ns.")
-        if path not in known:
-            continue
-        try:
-            _set(config, path, read_value(path, str(value), known))
-        except UserError as error:
-            raise UserError(f"{where}: {error}") from None
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:

@@ -36,7 +36,7 @@ def with_noisy_poses(stage: Stage) -> Stage:
     draw = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
 
     def move(view: View) -> View:
-        axis = torch.nn.functional.normalize(torch.randn(3, **draw), dim=0)
+        axis = F.normalize(torch.randn(3, **draw), dim=0)
         angle = math.radians(TURN_DEGREES) * float(torch.randn((), generator=draw["generator"]))
         matrix = view.viewmat.double().clone()
         matrix[:3] = torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix()) @ matrix[:3]
@@ -44,14 +44,6 @@ def with_noisy_poses(stage: Stage) -> Stage:
         return replace(view, viewmat=matrix.float())
 
     return replace(stage, views=[move(view) for view in stage.views])
-
-
-def with_gains(stage: Stage) -> Stage:
-    """Every other photo brighter, as a camera that chooses its exposure leaves them; clipped at white."""
-    photos = {
-        i: (photo * (GAIN if k % 2 else 1)).clamp(0, 1) for k, (i, photo) in enumerate(stage.photos.items())
-    }
-    return replace(stage, photos=photos)
 
 
 def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
@@ -98,8 +90,10 @@ def sparse(lab: Lab) -> Finding:
 )
 def inexact(lab: Lab) -> Finding:
     """A12: poses that are off, exposures that differ."""
-    stage = make_stage()
-    return lost(lab, {"noisy poses": with_noisy_poses(stage), "two exposures": with_gains(stage)})
+    stage, photos = make_stage(), {}
+    for k, (index, photo) in enumerate(stage.photos.items()):  # as a camera that chooses its exposure
+        photos[index] = (photo * (GAIN if k % 2 else 1)).clamp(0, 1)
+    return lost(lab, {"noisy poses": with_noisy_poses(stage), "two exposures": replace(stage, photos=photos)})
 
 
 VISITS_RISING = 0.05

@@ -62,7 +62,6 @@ class RunLog:
         self._flush()
 
     def __call__(self, event: events.Event) -> None:
-        """Take note of an event."""
         match event:
             case events.StepTaken():
                 self._take_step(event)
@@ -144,8 +143,7 @@ class RunLog:
             with open(self._path, "a", encoding="utf-8") as file:
                 file.write(text)
         except OSError as error:
-            what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."
-            say(what, "yellow")
+            say(f"{self._path} cannot be written ({error.strerror}); the run's log ends here.", "yellow")
             self._path = None
 
 

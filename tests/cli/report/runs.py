@@ -78,16 +78,13 @@ def made_up_settings(method: str = "abcd", **fields) -> Settings:
     return Settings(**{**values, **fields})
 
 
-def made_up_checkpoint(path: Path) -> Checkpoint:
-    """Three blocks over a cloud of points."""
-    means = torch.randn(600, 3, generator=torch.Generator().manual_seed(0))
-    return Checkpoint(path / "step.ckpt", 40, {"_model.gauss_params.means": means}, build_kd(means, 3))
-
-
 def made_up_run(tmp_path: Path, **settings) -> RunFolder:
-    """A run without a folder."""
+    """A run without a folder: three blocks over a cloud of points."""
+    means = torch.randn(600, 3, generator=torch.Generator().manual_seed(0))
+    tensors = {"_model.gauss_params.means": means}
+    checkpoint = Checkpoint(tmp_path / "step.ckpt", 40, tensors, build_kd(means, 3))
     story = read_story(write_log(tmp_path / "log.jsonl", log_lines()))
-    return RunFolder(tmp_path, made_up_settings(**settings), story, made_up_checkpoint(tmp_path))
+    return RunFolder(tmp_path, made_up_settings(**settings), story, checkpoint)
 
 
 def made_up_folder(path: Path) -> Path:

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import LATE_RATE, Pace, adam_step, attach, detach, nothing_active
 from abcd_ns.engine.types import PARAM_NAMES
-from tests.reference.scenes import random_gaussians
+from tests.reference.scenes import activated, random_gaussians
 
 
 def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
-    params, adam = nothing_active(sh_degree=1)
-    attach(BlockState.fresh(random_gaussians(1)), params, adam)
+    params, adam = activated(random_gaussians(1))
     pace, before = Pace(adam, fast_start=False), {name: params[name].detach().clone() for name in PARAM_NAMES}
     for _ in range(steps):
         pace.set(views, 0, means_decay=1.0)

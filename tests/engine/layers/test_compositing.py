@@ -49,6 +49,5 @@ def test_a_sandwich_is_the_fold_on_the_background(seed, dtype, image):
     background = random_layers(seed + 1, 1, dtype)[0].color
     background = background if image else background[0, 0]
     expected = composite(fold(layers), background)
-    torch.testing.assert_close(
-        sandwich(front, active, back, background), expected, rtol=0.0, atol=TOLERANCE[dtype]
-    )
+    found = sandwich(front, active, back, background)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=TOLERANCE[dtype])

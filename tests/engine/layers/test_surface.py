@@ -47,9 +47,8 @@ def facing(k: int, view: View, primitive: str) -> torch.Tensor:
 def drawn(primitive: str, view: View, pass_gaussians: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The median depth and the normals of a picture."""
     depth = median_depth(renderer_of(primitive, pass_gaussians), view, SETTINGS)
-    renderer = renderer_of(
-        primitive, pass_gaussians, lambda g: colored_by_normal(g, view, primitive == "2dgs")
-    )
+    is_flat = primitive == "2dgs"
+    renderer = renderer_of(primitive, pass_gaussians, lambda g: colored_by_normal(g, view, is_flat))
     assert (len(renderer.nodes()) == 4) == (pass_gaussians == 0)
     return depth, normals_in(renderer.picture(view, SETTINGS))
 

@@ -11,16 +11,9 @@ from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import MemoryScene
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import WatchedScene, random_gaussians, ring_of_views
 
 BLOCK = 5
-
-
-class Watched(MemoryScene):
-    def drawn(self, block, device, which=None):
-        self.read.append(block)
-        return super().drawn(block, device, which)
 
 
 def visit_layers(
@@ -28,8 +21,7 @@ def visit_layers(
 ) -> tuple[VisitLayers, list[int]]:
     """Of a visit to one of 16 blocks, and the blocks that it has read so far."""
     gaussians, draw, views = random_gaussians(200, size=0.03), TorchRasterizer(), ring_of_views(6)
-    scene = Watched(build_kd(gaussians.means, 16), gaussians)
-    scene.read = []
+    scene = WatchedScene(build_kd(gaussians.means, 16), gaussians)
     renderer = LayerRenderer(scene, draw, ownership="fragments", pass_gaussians=0)
     own = scene.gaussians(BLOCK)
     layers = VisitLayers(

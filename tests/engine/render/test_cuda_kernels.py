@@ -100,13 +100,9 @@ for count, always in ((0, 0), (1, 0), (700, 0), (700, 150)):
 def test_they_are_their_twins():
     """In one process, since the interpreter is chosen when kernels are imported."""
     pytest.importorskip("triton")
-    done = subprocess.run(
-        [sys.executable, "-c", LOSS + BETWEEN + GAUSSIANS + WINDOWS],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-c", LOSS + BETWEEN + GAUSSIANS + WINDOWS]
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
@@ -119,9 +115,8 @@ class Elsewhere(torch.Tensor):
         return -1  # for a guard: no device that there is
 
 
-ON_CUDA, DOUBLE = (
-    torch.zeros(4, dtype=kind).as_subclass(Elsewhere) for kind in (torch.float32, torch.float64)
-)
+ON_CUDA = torch.zeros(4).as_subclass(Elsewhere)
+DOUBLE = torch.zeros(4, dtype=torch.float64).as_subclass(Elsewhere)
 
 
 def failing(error):

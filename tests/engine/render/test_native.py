@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -143,28 +144,26 @@ def failing(monkeypatch, returncode: int = 1, stderr: str = "native.cpp:1:1: err
     monkeypatch.setattr(native, "find_compiler", lambda: "g++")
 
 
-@pytest.mark.parametrize(
-    ("fault", "says"),
-    [
-        ("compiler fails", "no such instruction"),
-        ("compiler is killed", "died with"),
-        ("no compiler", "apt-get install g"),
-        ("folder is a file", "kernels"),
-        ("damaged library", "native-"),
-    ],
-)
-def test_without_the_library_one_line_says_why_and_torch_draws(own_library, monkeypatch, fault, says):
-    if fault == "compiler fails":
-        failing(monkeypatch)
-    elif fault == "compiler is killed":
-        failing(monkeypatch, -9, "")
-    elif fault == "no compiler":
-        monkeypatch.setattr(native, "find_compiler", lambda: None)
-    elif fault == "folder is a file":
-        own_library.write_text("")
-    else:
-        own_library.mkdir()
-        native.library_path().write_bytes(b"not a library")
+def damaged(folder: Path) -> None:
+    folder.mkdir()
+    native.library_path().write_bytes(b"not a library")
+
+
+FAULTS = {
+    "compiler fails": (lambda patch, _: failing(patch), "no such instruction"),
+    "compiler is killed": (lambda patch, _: failing(patch, -9, ""), "died with"),
+    "no compiler": (
+        lambda patch, _: patch.setattr(native, "find_compiler", lambda: None),
+        "apt-get install g",
+    ),
+    "folder is a file": (lambda _, folder: folder.write_text(""), "kernels"),
+    "damaged library": (lambda _, folder: damaged(folder), "native-"),
+}
+
+
+@pytest.mark.parametrize(("happen", "says"), FAULTS.values(), ids=FAULTS)
+def test_without_the_library_one_line_says_why_and_torch_draws(own_library, monkeypatch, happen, says):
+    happen(monkeypatch, own_library)
     rasterizer = TorchRasterizer()
     with pytest.warns(UserWarning, match=f"runs in torch, 20 times slower: .*{says}") as told:
         rasterizer.warm_up()

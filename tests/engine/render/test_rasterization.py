@@ -28,26 +28,16 @@ def drawn(gaussians: Gaussians, views=VIEWS, sh_degree: int | None = 2, **option
     colors = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
     if sh_degree is None:
         colors = (0.28209479177387814 * gaussians.features_dc + 0.5).clamp_min(0)
-    return rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        gaussians.opacities[:, 0].sigmoid(),
-        colors,
-        torch.stack([view.viewmat for view in views]),
-        torch.stack([view.K for view in views]),
-        views[0].width,
-        views[0].height,
-        sh_degree=sh_degree,
-        **options,
-    )
+    looks = gaussians.scales.exp(), gaussians.opacities[:, 0].sigmoid(), colors
+    cameras = torch.stack([view.viewmat for view in views]), torch.stack([view.K for view in views])
+    given = gaussians.means, gaussians.quats, *looks, *cameras, views[0].width, views[0].height
+    return rasterization(*given, sh_degree=sh_degree, **options)
 
 
 def as_raster(gaussians: Gaussians, view: View, **options) -> SimpleNamespace:
     pictures, alphas, _ = drawn(gaussians, [view], render_mode="RGB+D", **options)
-    return SimpleNamespace(
-        color=pictures[0, ..., :3], transmittance=1 - alphas[0, ..., 0], depth=pictures[0, ..., 3]
-    )
+    color, depth = pictures[0, ..., :3], pictures[0, ..., 3]
+    return SimpleNamespace(color=color, transmittance=1 - alphas[0, ..., 0], depth=depth)
 
 
 @pytest.mark.parametrize(("sh_degree", "mode"), [(None, "classic"), (0, "antialiased"), (3, "classic")])

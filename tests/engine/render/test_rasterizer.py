@@ -98,9 +98,8 @@ def test_residuals_are_summed_by_weight_and_place():
         (gradient,) = torch.autograd.grad(naive.color[y, x, 0], dark.features_dc, retain_graph=True)
         weight, r = gradient.flatten(1)[:, :1] / SH_C0, residual[y, x, :3]
         place = torch.tensor([crop.x + x + 0.5, crop.y + y + 0.5]) - naive.means2d.detach()
-        expected += weight * torch.cat(
-            (residual[y, x, 3:].expand(6, 1), r.expand(6, 3), place[:, :1] * r, place[:, 1:] * r), dim=1
-        )
+        parts = residual[y, x, 3:].expand(6, 1), r.expand(6, 3), place[:, :1] * r, place[:, 1:] * r
+        expected += weight * torch.cat(parts, dim=1)
 
     shot = Shot(VIEW, crop, EAGER.project(frozen, VIEW))
     (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1, residual_sums=True)
@@ -153,9 +152,8 @@ def test_needles_and_oversized_gaussians_have_finite_gradients_in_float32():
     gaussians = random_gaussians(8, dtype=torch.float32)
     scales = torch.tensor([[-12.0, -12, 3], [6, 6, 6], [-20, -20, -20], [3, -9, -9]]).repeat(2, 1)
     view = small_view(dtype=torch.float32)
-    image, grads = gradients(
-        lambda g: EAGER(g, view, sh_degree=3, antialiased=True), replace(gaussians, scales=scales)
-    )
+    draw = partial(EAGER, view=view, sh_degree=3, antialiased=True)
+    image, grads = gradients(draw, replace(gaussians, scales=scales))
     assert image.isfinite().all()
     assert all(grad.isfinite().all() for grad in grads.values())
 

@@ -1,6 +1,6 @@
 """The self-check lets a sound backend pass and refuses one that is wrong in any way."""
 
-import dataclasses
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,17 +8,6 @@ import torch
 from abcd_ns.engine.kernels.native import library
 from abcd_ns.engine.render import TorchRasterizer, self_check
 from abcd_ns.engine.render.self_check import TOLERANCE
-from abcd_ns.engine.types import Crop, Gaussians
-
-
-def wrong_sign(gaussians: Gaussians) -> Gaussians:
-    """The right picture, and a gradient of the wrong sign."""
-    return dataclasses.replace(gaussians, quats=2 * gaussians.quats.detach() - gaussians.quats)
-
-
-def no_gradient(gaussians: Gaussians) -> Gaussians:
-    """The right picture, and no gradient."""
-    return dataclasses.replace(gaussians, opacities=gaussians.opacities.detach() + 0 * gaussians.opacities)
 
 
 class Broken(TorchRasterizer):
@@ -31,10 +20,11 @@ class Broken(TorchRasterizer):
         return splats[torch.arange(len(splats) - 1)] if self.fault == "a frozen splat missing" else splats
 
     def draw(self, gaussians, shots, **options):
-        if self.fault == "wrong sign":
-            gaussians = wrong_sign(gaussians)
+        quats, opacities = gaussians.quats, gaussians.opacities
+        if self.fault == "wrong sign":  # and the picture is right, as without gradient
+            gaussians = replace(gaussians, quats=2 * quats.detach() - quats)
         if self.fault == "no gradient":
-            gaussians = no_gradient(gaussians)
+            gaussians = replace(gaussians, opacities=opacities.detach() + 0 * opacities)
         if self.fault == "antialiasing lost":
             options["antialiased"] = False
         if self.fault == "degree of harmonics lost":
@@ -43,17 +33,14 @@ class Broken(TorchRasterizer):
         return tuple(self._raster(raster) for raster in rasters)
 
     def _shot(self, shot, first):
-        crop = shot.crop
-        if self.fault == "crop shifted" and crop.x:
-            return dataclasses.replace(shot, crop=Crop(crop.x - 1, crop.y, crop.width, crop.height))
+        if self.fault == "crop shifted" and shot.crop.x:
+            return replace(shot, crop=shot.crop._replace(x=shot.crop.x - 1))
         if self.fault == "frozen ignored":
-            return dataclasses.replace(shot, frozen=None)
-        if self.fault == "window ignored":
-            return dataclasses.replace(shot, z_window=None)
-        if self.fault == "window of own" and shot.frozen is not None:
-            return dataclasses.replace(shot, z_window=None)
+            return replace(shot, frozen=None)
+        if self.fault == "window ignored" or (self.fault == "window of own" and shot.frozen is not None):
+            return replace(shot, z_window=None)
         if self.fault == "camera of the first":
-            return dataclasses.replace(shot, view=dataclasses.replace(shot.view, K=first.view.K))
+            return replace(shot, view=replace(shot.view, K=first.view.K))
         return shot
 
     def _raster(self, raster):
@@ -61,9 +48,9 @@ class Broken(TorchRasterizer):
             sums = raster.info["sums"]
             sums.ask = lambda residuals: setattr(sums, "values", 0 * sums._find(residuals) + 1)
         if self.fault in ("color", "depth"):
-            return dataclasses.replace(raster, **{self.fault: 1.01 * getattr(raster, self.fault)})
+            return replace(raster, **{self.fault: 1.01 * getattr(raster, self.fault)})
         if self.fault == "transmittance":
-            return dataclasses.replace(raster, transmittance=raster.transmittance * float("nan"))
+            return replace(raster, transmittance=raster.transmittance * float("nan"))
         return raster
 
 
@@ -95,9 +82,8 @@ def test_a_sound_backend_passes():
     ],
 )
 def test_a_fault_is_refused(fault, what, case):
-    with pytest.raises(
-        RuntimeError, match=rf'"broken" on cpu is off in {what} of {case} by .* Set the rasterizer to "torch"'
-    ):
+    said = rf'"broken" on cpu is off in {what} of {case} by .* Set the rasterizer to "torch"'
+    with pytest.raises(RuntimeError, match=said):
         self_check(Broken(fault), "cpu")
 
 
@@ -108,6 +94,6 @@ def test_no_case_hangs_on_rounding(shift):
     class Rounding(TorchRasterizer):
         def draw(self, gaussians, shots, **options):
             logits = gaussians.opacities + shift
-            return super().draw(dataclasses.replace(gaussians, opacities=logits), shots, **options)
+            return super().draw(replace(gaussians, opacities=logits), shots, **options)
 
     assert 0 < self_check(Rounding(use_native=False, tile_side=16), "cpu") < TOLERANCE / 4

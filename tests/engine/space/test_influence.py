@@ -87,6 +87,9 @@ def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer
             assert known[block][view.index] == pytest.approx(share, abs=2e-6)
     assert unknown == {3}
     assert InfluenceTable(tree, range(4), known, "cpu").found() == (known, unknown)
+    few = torch.where(owner == 1)[0]
+    table.note(gaussians.means[few], views[:1], found[:1, few])  # whose blocks are looked up anew
+    assert [block for block, shares in table.found()[0].items() if 0 in shares] == [1]
 
 
 @given(
@@ -124,13 +127,3 @@ def test_blocks_overlap_where_the_same_views_show_them():
     third = 0.4 * 0.3 / (0.5 * 0.2**0.5)
     for others, expected in (([1], 1.0), ([2], 0.0), ([3], third), ([1, 2, 3], 1.0 + third), ([], 0.0)):
         assert overlaps(influence, [0, 9], others) == pytest.approx([expected, 0.0], abs=1e-5)  # none sees 9
-
-
-def test_moved_rows_are_looked_up_anew(rasterizer):
-    gaussians, (view,) = random_gaussians(80, seed=4, size=0.15), ring_of_views(1)
-    tree = build_kd(gaussians.means, 2)
-    (found,) = weights(gaussians, rasterizer, [Shot(view, view.full)])
-    table, few = InfluenceTable(tree, [0], {}, "cpu"), torch.where(tree.assign(gaussians.means) == 1)[0]
-    table.note(gaussians.means, [view], found[None])
-    table.note(gaussians.means[few], [view], found[None, few])
-    assert list(table.found()[0]) == [1]

@@ -48,14 +48,10 @@ def tree_around(seed: int, view: View) -> BlockTree:
     return tree
 
 
-def pixels(view: View) -> TileGrid:
-    """The image in tiles of one pixel."""
-    return TileGrid(view.full, 1)
-
-
 def leaf_windows(tree: BlockTree, view: View) -> tuple[torch.Tensor, torch.Tensor]:
     """near and far of all blocks, [K, h, w]."""
-    windows = [ray_interval(tree.cell(block), view, pixels(view)) for block in range(tree.num_blocks)]
+    grid = TileGrid(view.full, 1)
+    windows = [ray_interval(tree.cell(block), view, grid) for block in range(tree.num_blocks)]
     near, far = torch.stack([w.near for w in windows]), torch.stack([w.far for w in windows])
     return near.view(-1, view.height, view.width), far.view(-1, view.height, view.width)
 

@@ -205,10 +205,8 @@ def test_order_is_right_in_exact_arithmetic(seed, num_blocks):
     center, generator = lattice_points(seed, 1)[0], torch.Generator().manual_seed(seed)
     order = front_to_back(tree, center)
     assert sorted(order) == list(range(num_blocks))
-    boxes = [
-        [(low, high) for low, high in zip(cell.lower.tolist(), cell.upper.tolist(), strict=True)]
-        for cell in map(tree.cell, range(num_blocks))
-    ]
+    cells = map(tree.cell, range(num_blocks))
+    boxes = [list(zip(cell.lower.tolist(), cell.upper.tolist(), strict=True)) for cell in cells]
     start = [Fraction(c) for c in center.tolist()]
     for direction in torch.randint(-2, 3, (5, 3), generator=generator).tolist():
         crossings = {Fraction(0)}

@@ -119,11 +119,7 @@ def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
 
 @pytest.mark.parametrize(
     ("coarse_model", "warmup", "longer", "passes", "expected"),
-    [
-        (30, 0.5, 1, 2, 10),
-        (120, 0.2, 2, 3, 15),
-        (120, 0.2, 2, 24, 20),
-    ],
+    [(30, 0.5, 1, 2, 10), (120, 0.2, 2, 3, 15), (120, 0.2, 2, 24, 20)],
 )
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     make, photos, monkeypatch, coarse_model, warmup, longer, passes, expected

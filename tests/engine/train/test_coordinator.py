@@ -51,10 +51,8 @@ def test_one_block_is_plain_3dgs_bit_for_bit(make, views, photos, start, growing
 )
 def test_the_blocks_gradient_is_that_of_the_whole_picture(make, ownership, primitive):
     """Through kept F and B == through a render of all blocks at once (invariant 3), in float64."""
-    start, views = (
-        random_gaussians(100, size=0.08, dtype=torch.float64),
-        ring_of_views(3, dtype=torch.float64),
-    )
+    start = random_gaussians(100, size=0.08, dtype=torch.float64)
+    views = ring_of_views(3, dtype=torch.float64)
     options = {"ownership": ownership, "primitive": primitive, "density": STILL, "batch": 1}
     coordinator = make(start=start, views=views, blocks=4, window_weight=0.0, **options)
     for _ in range(3):
@@ -291,12 +289,10 @@ def test_a_block_inside_an_opaque_ball_is_visited_once_and_then_passed_over(tmp_
     draw = {"generator": torch.Generator().manual_seed(1)}
     shell = 0.5 * torch.nn.functional.normalize(torch.randn((900, 3), **draw), dim=1)
     wall = cloud_from_points(shell, torch.full((900, 3), 128.0), sh_degree=1).gaussians()
-    wall = replace(
-        wall, scales=torch.full_like(wall.scales, math.log(0.08)), opacities=torch.full((900, 1), 8.0)
-    )
-    inside = cloud_from_points(
-        0.02 * torch.randn((30, 3), **draw), torch.full((30, 3), 255.0), sh_degree=1
-    ).gaussians()
+    wall.scales.fill_(math.log(0.08))
+    wall.opacities.fill_(8.0)
+    middle = 0.02 * torch.randn((30, 3), **draw)
+    inside = cloud_from_points(middle, torch.full((30, 3), 255.0), sh_degree=1).gaussians()
     tree, origin = build_kd(torch.zeros(0, 3), 1), torch.zeros(1, 3)
     for axis in range(3):
         for at in (-0.2, 0.2):

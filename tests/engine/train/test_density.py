@@ -35,9 +35,8 @@ def statistics(*gains: float) -> dict[str, torch.Tensor]:
 
 
 def clock(**changes) -> DensityClock:
-    return DensityClock(
-        **{"progress": 0.2, "steps": 100, "taken": 1, "views": VIEWS, "room": None, **changes}
-    )
+    given = {"progress": 0.2, "steps": 100, "taken": 1, "views": VIEWS, "room": None}
+    return DensityClock(**{**given, **changes})
 
 
 def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
@@ -56,10 +55,7 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     assert narrower.tolist() == [[False, True, False]] * 5
 
 
-@pytest.mark.parametrize(
-    ("room", "added"),
-    [(None, 30), (200, 30), (12, 12), (0, 0)],
-)
+@pytest.mark.parametrize(("room", "added"), [(None, 30), (200, 30), (12, 12), (0, 0)])
 def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
     params, optimizers = activated(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))

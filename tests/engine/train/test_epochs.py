@@ -9,13 +9,12 @@ from torch.testing import assert_close
 
 from abcd_ns.engine.events import EpochEnded, PhotosWanted, VisitBegan
 from abcd_ns.engine.render.loss import photometric_loss
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.planner import LOOK_AGAIN
 from abcd_ns.engine.train.run_state import BlockHealth, Budget, Stopwatch
 from abcd_ns.engine.train.schedule import plan_epoch, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import STILL, assert_resumes, listen, stop
+from tests.reference.scenes import STILL, UNPRUNED, assert_resumes, listen, stop
 
 
 def narrow(views):
@@ -161,9 +160,7 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photo
 
 
 def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make, photos):
-    density = DensityConfig(
-        refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, min_contribution=0
-    )
+    density = replace(UNPRUNED, refine_stop=0.01, refine_every=1)
     coordinator = make(blocks=2, steps=60, coarse_model=40, visit_steps=8, density=density)
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:

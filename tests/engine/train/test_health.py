@@ -145,9 +145,8 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
-    monkeypatch.setattr(
-        "abcd_ns.engine.train.memory.free_bytes", lambda _: 30 * ACTIVE_COPIES * parameter_bytes(1)
-    )
+    free = 30 * ACTIVE_COPIES * parameter_bytes(1)
+    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: free)
     coordinator = make(blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)

@@ -23,12 +23,8 @@ PRICED = DensityConfig(min_contribution=1.0, refine_every=1000)
 def begin(make):
     """Makes runs with a warm-up of 12 steps."""
 
-    def begun(**options):
-        return make(
-            **{"blocks": 4, "steps": 60, "warmup": 0.2, "density": STILL, "coarse_model": 40, **options}
-        )
-
-    return begun
+    given = {"blocks": 4, "steps": 60, "warmup": 0.2, "density": STILL, "coarse_model": 40}
+    return lambda **options: make(**{**given, **options})
 
 
 @pytest.fixture
@@ -41,18 +37,16 @@ def grown(begin, photos):
     return made
 
 
-def asked_of(coordinator, monkeypatch, blind=()):
-    """Views that are asked where they see a block, a list for each time; the blind ones never see any."""
-    asked, extents = [], coordinator.run.rasterizer.extents
+def blindfold(coordinator, monkeypatch, blind: tuple[int, ...]) -> None:
+    """From now on these views see no block."""
+    extents = coordinator.run.rasterizer.extents
     nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
 
     def watched(gaussians, views):
-        asked.append([view.index for view in views])
         found = zip(views, extents(gaussians, views), strict=True)
         return torch.stack([nowhere if view.index in blind else row for view, row in found])
 
     monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
-    return asked
 
 
 def visits_of(coordinator) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
@@ -138,7 +132,7 @@ def test_when_the_warm_up_is_over_nothing_of_it_stays_active(begin, photos):
 
 def test_views_that_show_a_block_no_more_are_found_out(grown, monkeypatch):
     coordinator, blind = grown(visit_views=2), (0, 1, 2)
-    asked_of(coordinator, monkeypatch, blind)
+    blindfold(coordinator, monkeypatch, blind)
     coordinator.state.influence = {block: dict.fromkeys(blind, 0.1) for block in range(4)}
     for _ in range(4):
         active = coordinator.visits.begin()
@@ -162,7 +156,7 @@ def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
 
 def test_a_block_looks_at_a_doubtful_view_that_sees_it(grown, monkeypatch):
     coordinator = grown()
-    asked_of(coordinator, monkeypatch, blind=(1, 2, 4))
+    blindfold(coordinator, monkeypatch, blind=(1, 2, 4))
     coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
     active = coordinator.visits.begin()
     assert active.views == (0, 3)
@@ -177,13 +171,10 @@ def test_a_block_that_a_wall_hides_is_neither_read_nor_drawn(tmp_path, monkeypat
     before, behind = random_gaussians(200, size=0.05), random_gaussians(600, seed=1, size=0.05)
     before.means[:, 0] += 2.0
     behind.means[:, 0] -= 8.0
-    views = [
-        camera((6.0, y, 0.0), (0.0, 0.0, 0.1), index, (48, 36), focal=2.0)
-        for index, y in enumerate((-0.4, 0.4))
-    ]
-    run = make_coordinator(
-        tmp_path, Gaussians.cat([wall, before, behind]), views, blocks=8, window_weight=0.0
-    )
+    eyes = (6.0, -0.4, 0.0), (6.0, 0.4, 0.0)
+    views = [camera(eye, (0.0, 0.0, 0.1), index, (48, 36), focal=2.0) for index, eye in enumerate(eyes)]
+    scene = Gaussians.cat([wall, before, behind])
+    run = make_coordinator(tmp_path, scene, views, blocks=8, window_weight=0.0)
     hidden = {block for block in range(8) if float(run.scene.gaussians(block).means[:, 0].max()) < -5}
     whole = whole_scene(run)
     known = influence(whole, run.scene.tree.assign(whole.means), views, run.run.rasterizer)

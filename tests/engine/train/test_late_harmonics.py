@@ -41,9 +41,8 @@ def test_blocks_that_have_no_room_for_them_are_cut_in_two_when_growth_is_over(ma
     assert {count for is_early, count in blocks if is_early} == {4}
     assert highest_of(coordinator) == start.sh_degree
     room = limits_at(coordinator.config, start.sh_degree)
-    assert not any(
-        room.is_full(coordinator.scene.count(b), 8) for b in range(coordinator.scene.tree.num_blocks)
-    )
+    counts = map(coordinator.scene.count, range(coordinator.scene.tree.num_blocks))
+    assert not any(room.is_full(count, 8) for count in counts)
 
 
 def test_a_single_block_without_room_goes_on_without_them(make, photos):

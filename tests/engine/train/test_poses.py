@@ -26,9 +26,8 @@ def shaken(views, seed=1):
     draw = torch.Generator().manual_seed(seed)
     steps = NOISE * torch.randn(len(views), 6, generator=draw, dtype=torch.float64)
     steps[:, 3:] *= 3
-    return [
-        replace(v, viewmat=turned(v.viewmat.double(), s).float()) for v, s in zip(views, steps, strict=True)
-    ]
+    pairs = zip(views, steps, strict=True)
+    return [replace(v, viewmat=turned(v.viewmat.double(), s).float()) for v, s in pairs]
 
 
 def poses_of(run) -> torch.Tensor:

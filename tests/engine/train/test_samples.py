@@ -36,9 +36,8 @@ def all_parts(crop: Crop, most: int) -> list[Crop]:
     """Every part that may be drawn, as often as it is likely."""
     asked = Fixed()
     random_part(crop, most, asked)
-    return [
-        random_part(crop, most, Fixed(numbers)) for numbers in itertools.product(*map(range, asked.ranges))
-    ]
+    choices = itertools.product(*map(range, asked.ranges))
+    return [random_part(crop, most, Fixed(numbers)) for numbers in choices]
 
 
 @given(CROPS, st.integers(1, 3_000_000), st.integers())
@@ -52,10 +51,9 @@ def test_parts_lie_in_the_crop_keep_to_the_limit_and_meet_at_whole_tiles(crop, m
     assert inside.x + part.width <= crop.width
     assert inside.y + part.height <= crop.height
     assert part.pixels <= max(most, ALIGN * ALIGN)
-    columns, rows = (part.x, part.x + part.width), (part.y, part.y + part.height)
-    for edge in columns:
+    for edge in (part.x, part.x + part.width):
         assert edge in (crop.x, crop.x + crop.width) or edge % ALIGN == 0
-    for edge in rows:
+    for edge in (part.y, part.y + part.height):
         assert edge in (crop.y, crop.y + crop.height) or edge % ALIGN == 0
 
 

@@ -85,9 +85,8 @@ def test_rates_of_one_block_fall_at_the_end_of_the_run():
 
 
 def test_degree_of_30000_steps_is_splatfactos():
-    assert [sh_degree_at(step / 30_000, 0.1, 3) for step in range(30_000)] == [
-        min(step // 1000, 3) for step in range(30_000)
-    ]
+    degrees = [sh_degree_at(step / 30_000, 0.1, 3) for step in range(30_000)]
+    assert degrees == [min(step // 1000, 3) for step in range(30_000)]
     assert sh_degree_at(0.0, 0.0, 3) == 3
 
 

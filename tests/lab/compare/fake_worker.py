@@ -34,7 +34,7 @@ path.with_name("run.json").write_text(json.dumps(run))
 
 class FakeWorker:
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.command = folder, (sys.executable, str(folder / "worker.py"))
         folder.mkdir()
         (folder / "worker.py").write_text(WORKER)
         (folder / "run.json").write_text(json.dumps(asdict(made_up_run())))
@@ -45,10 +45,6 @@ class FakeWorker:
         run that is made up."""
         named = {name.replace("_", "-"): what for name, what in by_method.items()}
         (self.folder / "behaviour.json").write_text(json.dumps({**named, **(changed or {})}))
-
-    @property
-    def command(self) -> tuple[str, ...]:
-        return (sys.executable, str(self.folder / "worker.py"))
 
     def calls(self) -> list[str]:
         """Methods, and what was changed of them, that it was started for since the last call of this."""

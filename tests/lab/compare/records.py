@@ -17,37 +17,19 @@ def read_results(path: Path) -> Results:
     return read_record(path, Results, SCHEMA)
 
 
-def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: float = 1.0, **fields) -> Run:
-    """A run that rises towards `psnr`, the faster the larger `speed`."""
+def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, **fields) -> Run:
+    """A run that rises towards `psnr`."""
     moments = [(k / 6) ** 2 * 60 for k in range(1, 7)]
-    curve = [CurvePoint(s, int(s * 10), psnr - 9 / (1 + s * speed)) for s in moments]
-    values = {
-        "method": method,
-        "scene": "made-up",
-        "seed": seed,
-        "blocks": 1 if method == "abcd-monolithic" else 8,
-        "steps": 600,
-        "train_seconds": 60.0,
-        "total_seconds": 75.5,
-        "psnr": psnr - 0.1,
-        "ssim": 0.8,
-        "lpips": None,
-        "lpips_reason": "no weights",
-        "psnr_merged": curve[-1].psnr,
-        "ssim_merged": 0.79,
-        "ordering_gap_db": 45.0,
-        "ordering_gap_note": None,
-        "gaussians": 12345,
-        "peak_device_bytes": None,
-        "peak_device_note": "no CUDA device",
-        "peak_rss_bytes": 3 << 29,
-        "store_bytes": 1 << 28,
-        "layer_seconds": 12.0,
-        "curve": tuple(curve),
-        "views": (ViewScore(0, "0000.png", psnr, 0.8, None, psnr, None),),
-        "versions": VERSIONS,
-    }
-    return Run(**{**values, **fields})
+    curve = [CurvePoint(s, int(s * 10), psnr - 9 / (1 + s)) for s in moments]
+    made = {"method": method, "scene": "made-up", "seed": seed, "steps": 600, "versions": VERSIONS}
+    size = {"blocks": 1 if method == "abcd-monolithic" else 8, "gaussians": 12345, "store_bytes": 1 << 28}
+    times = {"train_seconds": 60.0, "total_seconds": 75.5, "layer_seconds": 12.0, "curve": tuple(curve)}
+    scores = {"psnr": psnr - 0.1, "ssim": 0.8, "psnr_merged": curve[-1].psnr, "ssim_merged": 0.79}
+    scores["views"] = (ViewScore(0, "0000.png", psnr, 0.8, None, psnr, None),)
+    lpips = {"lpips": None, "lpips_reason": "no weights"}
+    gap = {"ordering_gap_db": 45.0, "ordering_gap_note": None}
+    peaks = {"peak_rss_bytes": 3 << 29, "peak_device_bytes": None, "peak_device_note": "no CUDA device"}
+    return Run(**{**made, **size, **times, **scores, **lpips, **gap, **peaks, **fields})
 
 
 def made_up_settings(**fields) -> Settings:

@@ -6,7 +6,6 @@ import pytest
 from rich.console import Console
 
 from abcd_ns.engine.train.memory import DeviceNeeds
-from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_budgets
 from abcd_ns.lab.compare.command import Options, make_plan, shares_of, within_budgets
 from abcd_ns.lab.job import Job
@@ -60,16 +59,3 @@ def test_joint_training_has_as_many_gaussians_as_fit_and_blocks_choose_for_thems
     assert joint.training.density.max_gaussians == share // DeviceNeeds(0, 1).gaussian_bytes
     assert (blocks.blocks, blocks.gaussian_bytes, blocks.training.density.max_gaussians) == (0, share, 0)
     assert blocks.workers == 1  # one device
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        ("blocks", (4,), "--blocks does not go with --budgets"),
-        ("vary", ("training.warmup=0",), "--vary does not go with --budgets"),
-        *(("budgets", (n,), "give shares above 0 and up to 1") for n in ("0", "-1/2", "2", "half", "1/0")),
-    ],
-)
-def test_what_contradicts_budgets_or_is_none_is_refused(options, name, value, says):
-    with pytest.raises(UserError, match=says):
-        make_plan(Options(**{**vars(options), name: value}))

@@ -11,6 +11,7 @@ from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import check_options, trainer_config
 
 CONFIGS = own_configs(trains=False)
+TILES = {"data": None, "steps": None, "tiles": (2, 4)}
 
 
 def options(scene: Path, **given) -> Options:
@@ -50,6 +51,19 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"visits": 5}, "--visits goes with --tiles only"),
         ({"tile_gaussians": 9}, "--tile-gaussians goes with --tiles only"),
         ({"vary": ("device-budget-gb=1",)}, "no effect where the number of blocks is given"),
+        ({"budgets": ("1/4",), "blocks": (4,)}, "--blocks does not go with --budgets"),
+        ({"budgets": ("1/4",), "vary": ("training.warmup=0",)}, "--vary does not go with --budgets"),
+        *(({"budgets": (n,)}, "give shares above 0 and up to 1") for n in ("0", "-1/2", "2", "half", "1/0")),
+        (TILES | {"tiles": (2, 6)}, "powers of 2"),
+        (TILES | {"tiles": (4, 4)}, "different"),
+        (TILES | {"tiles": (0,)}, "from 1 on"),
+        (TILES | {"tiles": ()}, "different"),
+        (TILES | {"tile_gaussians": 0}, "--tile-gaussians is 0"),
+        (TILES | {"visits": 0}, "--visits is 0"),
+        (TILES | {"data": "scene"}, "--data does not go with --tiles"),
+        (TILES | {"steps": 9, "vary": ("training.batch=1",)}, "--steps does not go with --tiles"),
+        (TILES | {"methods": ("abcd", "abcd-exact")}, "not abcd-exact"),
+        (TILES | {"tiles": (2**18,), "tile_gaussians": 10**6}, "GiB free"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, given, message):
@@ -102,10 +116,8 @@ def test_changes_are_arms_beside_the_method_as_it_is_and_one_block_is_one_block(
 
 def test_a_change_of_many_options_has_a_folder_of_its_own_that_disks_take(tmp_path):
     names = "min_contribution", "split_pixels", "refine_start", "refine_stop", "cull_alpha_thresh"
-    long = (
-        " ".join(f"training.density.{name}=0.25" for name in names) + " training.warmup=0.2 training.batch="
-    )
-    plan = make_plan(options(tmp_path, vary=(f"{long}1", f"{long}2")))
+    long = " ".join(f"training.density.{name}=0.25" for name in names) + " training.warmup=0.2"
+    plan = make_plan(options(tmp_path, vary=(f"{long} training.batch=1", f"{long} training.batch=2")))
     folders = {job.folder(tmp_path) for job in plan.jobs}
     assert len(folders) == 3
     assert all(len(folder.name) < 255 for folder in folders)
@@ -130,18 +142,10 @@ def test_the_examples_make_plans(path, tmp_path):
     assert {job.method for job in plan.jobs} <= set(METHODS)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
-        ("blocks = 'three'", r"Expected array \| null, got str - at blocks"),
-        ("methods = ['nerfacto']", "nerfacto"),
-    ],
-)
-def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
+def test_a_bad_file_is_refused_in_one_line(tmp_path):
     path = tmp_path / "compare.toml"
-    path.write_text(text)
-    with pytest.raises(UserError, match=message) as caught:
+    path.write_text("methods = ['nerfacto']")
+    with pytest.raises(UserError, match="nerfacto") as caught:
         read_options(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

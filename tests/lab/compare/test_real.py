@@ -15,6 +15,7 @@ from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
 from tests.reference.colmap_scene import HELD_OUT, write_scene
 
+METHODS = "abcd-monolithic", "abcd", "splatfacto-scaled"
 STEPS = 20
 
 
@@ -23,15 +24,8 @@ def compared(tmp_path_factory):
     """(results, plan, what was printed) of methods, really trained, the first in a process of its own."""
     folder = tmp_path_factory.mktemp("compare")
     write_scene(folder / "scene")
-    options = Options(
-        data=str(folder / "scene"),
-        out=str(folder / "out"),
-        methods=("abcd-monolithic", "abcd", "splatfacto-scaled"),
-        steps=STEPS,
-        blocks=(2,),
-        evals=3,
-        pictures=1,
-    )
+    given = {"methods": METHODS, "steps": STEPS, "blocks": (2,), "evals": 3, "pictures": 1}
+    options = Options(data=str(folder / "scene"), out=str(folder / "out"), **given)
     plan, stream = make_plan(options), StringIO()
     with pytest.MonkeyPatch.context() as patch:
         jobs_in_this_process(patch, first_is_real=True)
@@ -53,7 +47,7 @@ def test_a_scene_is_as_large_as_its_export(compared, tmp_path):
 @pytest.mark.cli
 def test_runs_report_what_was_asked_for(compared):
     results, _, printed = compared
-    assert [run.method for run in results.runs] == ["abcd-monolithic", "abcd", "splatfacto-scaled"]
+    assert tuple(run.method for run in results.runs) == METHODS
     for run in results.runs:
         assert run.steps == STEPS
         assert len(run.views) == HELD_OUT

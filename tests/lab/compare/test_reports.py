@@ -13,7 +13,7 @@ from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.results import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
-from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
+from abcd_ns.lab.results.tables import notes, print_rows, rows
 from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run, made_up_settings
 
 # The charts
@@ -21,8 +21,7 @@ from tests.lab.compare.records import made_up, made_up_arm, made_up_results, mad
 
 def counted(*counts: int, **fields):
     base = made_up_run(**fields)
-    curve = base.curve[: len(counts)]
-    points = [dataclasses.replace(p, gaussians=n) for p, n in zip(curve, counts, strict=True)]
+    points = (dataclasses.replace(p, gaussians=n) for p, n in zip(base.curve, counts, strict=False))
     return dataclasses.replace(base, curve=tuple(points))
 
 
@@ -52,7 +51,7 @@ def test_without_a_run_there_is_no_chart_and_without_counts_none_of_gaussians(tm
 # The table
 
 
-def test_table_has_a_column_per_method_and_a_row_per_known_measure(tmp_path):
+def test_table_has_a_column_per_method_and_a_row_per_known_measure():
     lpips = {"lpips": 0.25}
     results = made_up_results(made_up_run("abcd-monolithic", psnr=25.0), made_up_run(psnr=24.0, **lpips))
     titles, *body = rows(results)
@@ -66,12 +65,6 @@ def test_table_has_a_column_per_method_and_a_row_per_known_measure(tmp_path):
     assert table["blocks on disk (MiB)"] == ["256.0", "256.0"]
     wanted = "PSNR SSIM LPIPS merged gap Gaussians steps training layers process RAM disk"
     assert all(any(word in title for title in table) for word in wanted.split())
-
-    write_table(results, tmp_path / "table.md")
-    lines = (tmp_path / "table.md").read_text().splitlines()
-    widths = {line.count("|") for line in lines if line.startswith("|")}
-    assert widths == {4}
-    assert len([line for line in lines if line.startswith("|")]) == 2 + len(body)
 
 
 def test_changes_have_their_difference_to_the_method_as_it_is_seed_by_seed():
@@ -170,9 +163,5 @@ def test_within_budgets_pictures_are_of_the_smallest_beside_what_no_limit_gives(
     jobs = tuple(Job(m, 0, made_up_settings(), changes) for m, arms in asked.items() for changes in arms)
     results = made_up("comparison", *(made_up_arm(j.variant, None, {0: 24.0}, j.method) for j in jobs))
     found = shown(results, Plan("comparison", results.settings, Path("out"), jobs, "abcd"))
-    assert [label for label, _, _ in found] == [
-        "abcd-monolithic",
-        "abcd-monolithic, 2 MiB",
-        "abcd, 2 MiB",
-    ]
+    assert [label for label, _, _ in found] == ["abcd-monolithic", "abcd-monolithic, 2 MiB", "abcd, 2 MiB"]
     assert len({folder for _, _, folder in found}) == 3

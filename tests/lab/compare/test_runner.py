@@ -36,12 +36,6 @@ def run(plan: Plan, overwrite: bool = False) -> list[Run | Failure]:
     return [found[job.method, job.seed] for job in plan.jobs]
 
 
-def with_settings(plan: Plan, **changed) -> Plan:
-    settings = dataclasses.replace(plan.settings, **changed)
-    jobs = tuple(dataclasses.replace(job, settings=settings) for job in plan.jobs)
-    return dataclasses.replace(plan, settings=settings, jobs=jobs)
-
-
 def test_finished_runs_are_reused_and_others_are_not(plan, worker):
     first = run(plan)
     assert [outcome.method for outcome in first] == worker.calls() == ["abcd-monolithic", "abcd"]
@@ -98,7 +92,9 @@ def test_another_protocol_or_machine_is_refused_by_name_until_overwritten(plan, 
     run(plan)
     worker.calls()
     for field, value in (("steps", 11), ("blocks", 2), ("data", "other")):
-        other = with_settings(plan, **{field: value})
+        settings = dataclasses.replace(plan.settings, **{field: value})
+        jobs = tuple(dataclasses.replace(job, settings=settings) for job in plan.jobs)
+        other = dataclasses.replace(plan, settings=settings, jobs=jobs)
         with pytest.raises(UserError, match=rf"holds runs with {field} .*, not {value}"):
             run(other)
     assert worker.calls() == []

@@ -18,8 +18,6 @@ GOOD = Outcome(
     "A3", "NaN | in splats", "NaN put in", "mended", True, False, {"abcd": "fine"}, {"lost": 0.1}, 2.0
 )
 BAD = replace(GOOD, id="A5", passed=False, worse=True)
-
-
 FINE = Scenario("A3", "fails", "done", "rule", lambda _: Finding(True, {"abcd": "fine"}))
 
 

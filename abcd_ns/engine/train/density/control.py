@@ -17,24 +17,8 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.render.projection import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
-from abcd_ns.engine.train.density.growing import (
-    WORTH,
-    Judged,
-    add_picture,
-    chosen,
-    share_seen,
-    split_gaussians,
-    worth,
-)
-from abcd_ns.engine.train.density.pruning import (
-    FAINT,
-    LAST,
-    blend_sums,
-    contributions,
-    floaters,
-    have_contributions,
-    risen,
-)
+from abcd_ns.engine.train.density import growing, pruning
+from abcd_ns.engine.train.density.growing import WORTH, Judged
 
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
@@ -174,7 +158,7 @@ class DensityControl:
     def _ends(self, first: bool) -> float:
         """Share of the run after which nothing grows."""
         begins, ends = self.config.refine_start, self.config.refine_stop
-        return max(ends, LAST) if first and begins < ends else ends
+        return max(ends, pruning.LAST) if first and begins < ends else ends
 
     def after_step(
         self,
@@ -196,14 +180,14 @@ class DensityControl:
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth, False
-        sums = blend_sums(infos, clock.views)
+        sums = pruning.blend_sums(infos, clock.views)
         growth = {**growth, **{name: growth.get(name, 0.0) + value for name, value in sums.items()}}
         for picture in judged:
-            add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
+            growing.add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
         if not self.asks(clock.progress, clock.first):
             growth.pop(WORTH, None)
         # What a picture shows is asked for last: an accelerator is waited for.
-        if WORTH not in growth or not (self.is_due(clock) and self.is_due(clock, share_seen(growth))):
+        if WORTH not in growth or not (self.is_due(clock) and self.is_due(clock, growing.share_seen(growth))):
             return growth, False
         return self._refined(params, optimizers, growth, clock), True
 
@@ -218,14 +202,14 @@ class DensityControl:
         """Take out what fills too little of the block's views, at a share of the run, or less than `required`
         of it, px; floaters; and what is too faint for any picture to show, which nothing would train again.
         Gives the block's statistics from now on."""
-        if not self.config.prunes or not have_contributions(growth):
+        if not self.config.prunes or not pruning.have_contributions(growth):
             return growth
-        bounds = self.config.min_contribution, FAINT
-        least, faint = (risen(bound, progress, self.config.refine_stop) for bound in bounds)
+        bounds = self.config.min_contribution, pruning.FAINT
+        least, faint = (pruning.risen(bound, progress, self.config.refine_stop) for bound in bounds)
         opacities = torch.sigmoid(params["opacities"][:, 0])
-        found = contributions(growth)
+        found = pruning.contributions(growth)
         drop = (found <= least) | (found < required) | (opacities < MIN_ALPHA)
-        drop |= floaters(growth, opacities, faint)
+        drop |= pruning.floaters(growth, opacities, faint)
         growth = dict(growth)  # rows are taken out of it
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)
@@ -234,13 +218,12 @@ class DensityControl:
     def _refined(
         self, params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clock: DensityClock
     ) -> dict[str, Tensor]:
-        config = self.config
-        wanted, axis = worth(growth, clock.views, config.split_pixels)
-        most = math.ceil(self.most_new(clock, share_seen(growth)) * len(wanted))
+        wanted, axis = growing.worth(growth, clock.views, self.config.split_pixels)
+        most = math.ceil(self.most_new(clock, growing.share_seen(growth)) * len(wanted))
         room = most if clock.room is None else min(most, clock.room)
-        growth = split_gaussians(params, optimizers, growth, chosen(wanted, room), axis)
+        growth = growing.split_gaussians(params, optimizers, growth, growing.chosen(wanted, room), axis)
         growth[WORTH] = torch.zeros_like(growth[WORTH])
-        faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
+        faint = torch.sigmoid(params["opacities"][:, 0]) < self.config.cull_alpha_thresh
         if bool(faint.any()):
             gsplat_ops.remove(params, optimizers, growth, faint)
         return growth

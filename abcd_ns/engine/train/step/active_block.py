@@ -11,17 +11,11 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, raise_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.store.commit import rows_for_visit, state_for_visit
+from abcd_ns.engine.train.density import pruning
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, LATE_START, START, are_gone, lower
 from abcd_ns.engine.train.density.growing import Judged
-from abcd_ns.engine.train.density.pruning import (
-    SHOWN,
-    contributions,
-    covered,
-    faded,
-    have_contributions,
-    veils,
-)
+from abcd_ns.engine.train.density.pruning import SHOWN
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, VisitKind
@@ -61,7 +55,8 @@ class ActiveBlock:
         stored = stored.to(run.device)
         self.is_new = not active.is_whole and bool(run.scene.state(active.geometry.block).deferred.any())
         if active.done == 0 and not run.config.recipe.keep_moments:
-            stored = stored.forgetful()
+            # As if no optimizer had ever seen it.
+            stored = replace(BlockState.fresh(stored.gaussians), clocks=replace(stored.clocks, adam_views=0))
         attach(stored, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
         self.growth = {name: value.clone() for name, value in stored.growth.items()}
@@ -89,9 +84,8 @@ class ActiveBlock:
 
     def let_go(self) -> None:
         """No block is active any more, and the device has its memory back."""
-        run = self._run
-        nobody = BlockState.fresh(Gaussians.empty(self._highest, run.device))
-        attach(nobody, run.params, run.optimizers)
+        nobody = BlockState.fresh(Gaussians.empty(self._highest, self._run.device))
+        attach(nobody, self._run.params, self._run.optimizers)
         self.growth, self._held = {}, None
 
     def end_visit(self, counts: bool) -> None:
@@ -137,10 +131,10 @@ class ActiveBlock:
     def _filling(self) -> Bool[Tensor, "n"]:
         """Which Gaussians are known to fill more than FILLS of the block's views."""
         run = self._run
-        if not have_contributions(self.growth):
+        if not pruning.have_contributions(self.growth):
             return torch.zeros(len(self), dtype=torch.bool, device=run.device)
         pixels = sum(run.views[view].full.pixels for view in run.active.trained_on)
-        return contributions(self.growth) > FILLS * pixels
+        return pruning.contributions(self.growth) > FILLS * pixels
 
     def prune(self) -> None:
         """Take out Gaussians that fill too little of the block's views, and harmonics that change too little.
@@ -149,11 +143,12 @@ class ActiveBlock:
         if before and run.density.config.prunes and run.share >= run.config.density.refine_stop:
             drawn = active_gaussians(run.params).detach(), run.rasterizer, run.config.antialiased
             trained_on = [run.views[view] for view in run.active.trained_on]
-            least = veils(list(run.views.values()), *drawn).maximum(SHOWN * covered(trained_on, *drawn))
+            least = pruning.veils(list(run.views.values()), *drawn)
+            least = least.maximum(SHOWN * pruning.covered(trained_on, *drawn))
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, least)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()
-        self.growth = faded(self.growth)
+        self.growth = pruning.faded(self.growth)
 
     def _lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""

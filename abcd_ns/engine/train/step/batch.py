@@ -216,7 +216,6 @@ class Backgrounds:
         self._tables: dict[int, tuple[int, Float[Tensor, "s 3"]]] = {}
 
     def at(self, step: int, place: int) -> Float[Tensor, "3"]:
-        """See `background`."""
         if self._device.type == "cpu":
             return background(self._config, step, place)
         first = step - step % BACKGROUNDS
