@@ -204,15 +204,16 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def _pixels(self, kind: Literal["image", "mask"], row: int, crop: Crop) -> torch.Tensor | None:
         """A crop on the device, of what is kept there or copied; None for no mask."""
         kept = self._on_device.get((kind, row))
-        if kept is None:
-            photos, device = self.train_dataset.photos, torch.device(self.device)
-            whole = photos.image(row) if kind == "image" else photos.mask(row)
-            if whole is None:
-                return None
-            if device.type == "cpu" or self._used + whole.nbytes > self.device_photo_bytes:
-                return upload(whole[crop.slices], device)
-            self._used += whole.nbytes
-            kept = self._on_device[kind, row] = upload(whole, device)
+        if kept is not None:
+            return kept[crop.slices]
+        photos, device = self.train_dataset.photos, torch.device(self.device)
+        whole = photos.image(row) if kind == "image" else photos.mask(row)
+        if whole is None:
+            return None
+        if device.type == "cpu" or self._used + whole.nbytes > self.device_photo_bytes:
+            return upload(whole[crop.slices], device)
+        self._used += whole.nbytes
+        kept = self._on_device[kind, row] = upload(whole, device)
         return kept[crop.slices]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts

@@ -52,10 +52,10 @@ def test_a_single_block_without_room_goes_on_without_them(make, photos):
     assert highest_of(coordinator) == 0
 
 
-@pytest.mark.parametrize(("blocks", "stop"), [(1, 47), (4, 60)])
-def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks, stop):
-    """Just before they come, and while they are there."""
-    assert_resumes(make, photos, stop, **{**LATE, "blocks": blocks}, block_limit=ROOMY)
+@pytest.mark.parametrize(("blocks", "stop", "limit"), [(1, 47, ROOMY), (4, 60, ROOMY), (4, 60, TIGHT)])
+def test_such_a_run_resumes_as_if_it_had_not_stopped(make, photos, blocks, stop, limit):
+    """Just before they come, while they are there, and while blocks are cut for them."""
+    assert_resumes(make, photos, stop, **{**LATE, "blocks": blocks}, block_limit=limit)
 
 
 def test_while_the_degree_rises_others_see_all_harmonics(make, photos, start):
