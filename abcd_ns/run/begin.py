@@ -24,7 +24,7 @@ from abcd_ns.engine.store.coarse_model import stored_blocks
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.splitting import cut_stored
+from abcd_ns.engine.train.density.splitting import end_joint
 from abcd_ns.engine.train.memory import LAYER_SHARE, coarse_model_size, limits_at
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run import TrainingRun
@@ -121,7 +121,7 @@ def begin_run(
         training = replace(training, limits=limits)
         if start is not None:
             state = RunState.from_json(store.state)
-            cut_stored(scene, state, limits_at(training, state.sh_degree))
+            end_joint(scene, state, limits_at(training, state.sh_degree))
         drawn = rasterizer, params, optimizers
         run = TrainingRun(training, budget, scene, capture.views, *drawn, device=device)
         trainer = _trainer_of(run, options, capture, device_bytes, remote)

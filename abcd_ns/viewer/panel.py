@@ -150,7 +150,8 @@ class AbcdPanel(ViewerControl):
         self._controls.write(headline=headline, epoch=epoch)
         self._controls.progress(coordinator.progress)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
-        if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
+        due = self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES
+        if coordinator.finished or (due and self.viewer.viser_server.get_clients()):
             self._curve_drawn = self._updated
             self._controls.write(curve=curve_image(self._log.curve, CURVE))
 

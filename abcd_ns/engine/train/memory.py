@@ -164,11 +164,11 @@ def limits_at(config: TrainingConfig, sh_degree: int) -> Limits:
     return replace(limits, sole_limit=sole, block_limit=block)
 
 
-def degree_with_room(config: TrainingConfig, largest: int, blocks: int) -> int:
-    """The highest degree for which the largest of so many blocks, of `largest` Gaussians, has room."""
+def degree_with_room(config: TrainingConfig, gaussians: int) -> int:
+    """The highest degree for which a block alone, of so many Gaussians, has room."""
     least = config.growing_degree
     degrees = range(config.sh_degree, least, -1)
-    return next((d for d in degrees if largest <= FULL * limits_at(config, d).of_block(blocks)), least)
+    return next((d for d in degrees if gaussians <= FULL * limits_at(config, d).of_block(1)), least)
 
 
 def levels_of(blocks: int) -> int:

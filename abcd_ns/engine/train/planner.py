@@ -5,12 +5,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from statistics import median_high
 
+from abcd_ns.engine.events import BlockSplit
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
 from abcd_ns.engine.space.visibility import Frusta, Optics
+from abcd_ns.engine.store.commit import pending_without, with_pending
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train import schedule
+from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, BlockHealth, VisitKind
 from abcd_ns.engine.train.step.batch import Batch, Pictures
@@ -153,11 +156,27 @@ class Planner(Visits):
             raise BlocksBusyError
         beside = overlaps(state.influence, (state.queue[place].block for place in free), busy)
         place = free[beside.index(min(beside))]
+        if self._cut(state.queue[place].block):
+            return self._next_plan(at_once)
         steps = self._steps_of(state.queue[place])
         plan = state.queue.pop(place)._replace(steps=steps)
         self._since = min(self._since, self._run.stopwatch.seconds)
         self._taken += _views_of(plan)
         return plan
+
+    def _cut(self, block: int) -> bool:
+        """Cut a block that is too large for a visit by now, as it gets more harmonics; whether it was. Its
+        parts take its place in the queue."""
+        run, scene = self._run, self._scene
+        if not run.limits.is_full(scene.count(block), scene.tree.num_blocks):
+            return False
+        large = {block: with_pending(scene, block), **pending_without(scene, {block})}
+        tree, parts, parents = cut_full(scene, large, run.state, run.limits)
+        for new, parent in parents.items():
+            run.announce(BlockSplit(parent, new))
+        if parents:
+            run.persist(tree, parts, self._config.commit_seconds)
+        return bool(parents)
 
     def _steps_of(self, plan: schedule.VisitPlan) -> int:
         """Of a visit in the queue: as many as planned, or, in the last epoch, its share of what is left. An

@@ -121,21 +121,24 @@ class TrainingRun:
     @property
     def _degree_limit(self) -> int:
         """What limits leave for the degree; it never falls."""
-        config, blocks, found = self.config, self.blocks, self.config.growing_degree
-        if not config.limits.late_harmonics:
-            return config.sh_degree
-        if self.share >= config.density.refine_stop:
-            alone = self.state.active is not None and self.state.active.is_alone
-            counts = [len(self.params["means"])] if alone else map(self.scene.count, range(blocks))
-            found = degree_with_room(config, max(counts), blocks)
+        config, found = self.config, self.config.growing_degree
+        grown = self.share >= config.density.refine_stop
+        if not config.limits.late_harmonics or (grown and self.among_others):
+            return config.sh_degree  # when its visit begins, a block is cut to have room for all
+        if grown:
+            alone = self.count() if self.state.active is None else len(self.params["means"])
+            found = degree_with_room(config, alone)
         return max(self.state.sh_degree, found)
 
     @property
+    def among_others(self) -> bool:
+        """Whether blocks are trained between layers of others, or as if they were."""
+        return self.blocks > 1 and self.config.recipe.overlap == 0
+
+    @property
     def limits(self) -> Limits:
-        """What a block may have at the present degree of harmonics; one among others, once growth is over, at
-        the highest, so that visits cut what has no room for that."""
-        grown = self.blocks > 1 and self.share >= self.config.density.refine_stop
-        return limits_at(self.config, self.config.sh_degree if grown else self.state.sh_degree)
+        """What a block may have at the present degree of harmonics."""
+        return limits_at(self.config, self.sh_degree)
 
     @property
     def active(self) -> ActiveVisit:

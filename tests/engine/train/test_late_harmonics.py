@@ -33,12 +33,16 @@ def test_what_is_active_has_no_more_harmonics_than_are_in_use(make, photos, star
     assert highest_of(coordinator) == start.sh_degree
 
 
-def test_blocks_that_have_no_room_for_them_are_cut_in_two_when_growth_is_over(make, photos, start):
-    coordinator, blocks = make(block_limit=TIGHT, **LATE), set()
+def test_blocks_that_have_no_room_for_them_are_cut_in_two_as_a_visit_begins_after_growth(make, photos, start):
+    coordinator, blocks, begun = make(block_limit=TIGHT, **LATE), set(), {}
     while not coordinator.finished:
+        is_early = coordinator.run.share < 0.5
         train_step(coordinator, photos)
         blocks.add((coordinator.run.share < 0.5, coordinator.scene.tree.num_blocks))
+        if (active := coordinator.state.active) is not None:
+            begun.setdefault(active.number, (is_early, active.sh_degree))
     assert {count for is_early, count in blocks if is_early} == {4}
+    assert {degree for is_early, degree in begun.values() if not is_early} == {start.sh_degree}
     assert highest_of(coordinator) == start.sh_degree
     room = limits_at(coordinator.config, start.sh_degree)
     counts = map(coordinator.scene.count, range(coordinator.scene.tree.num_blocks))

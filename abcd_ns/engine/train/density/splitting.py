@@ -4,7 +4,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.space.partition import best_split
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.coarse_model import split_by_block
-from abcd_ns.engine.store.commit import pending_without, with_pending, without
+from abcd_ns.engine.store.commit import without
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
@@ -70,24 +70,14 @@ def cut_full(
     return tree, updates, parents
 
 
-def cut_stored(scene: StoredScene, state: RunState, limits: Limits) -> None:
-    """Cut the blocks of a run that resumes with smaller limits than it had. One in training among others is
-    cut when its visit ends; the visit to a block that was the whole scene is over."""
+def end_joint(scene: StoredScene, state: RunState, limits: Limits) -> None:
+    """Where a run resumes with smaller limits, the visit to a block that is the whole scene is over if it is
+    too large now. Other blocks are cut when their visits begin."""
     active = state.active
-    for block in range(scene.tree.num_blocks) if limits.block_limit else ():
-        in_visit = active is not None and (active.is_whole or active.geometry.block == block)
-        if in_visit and not active.is_joint:
-            continue
-        saved = in_visit and active.saved
-        rows = scene.rows(ACTIVE) if saved else scene.count(block)
-        if not limits.is_full(rows, scene.tree.num_blocks):
-            continue
-        if saved:
-            found = scene.state(ACTIVE)
-            large = {block: found, ACTIVE: found.nobody}
-        else:
-            large = {block: with_pending(scene, block), **pending_without(scene, {block})}
-        tree, parts, _ = cut_full(scene, large, state, limits)
-        if tree is not scene.tree:
-            state.active = active = None if active is None or active.is_joint else active
-            scene.persist(tree, parts, state.to_json())
+    if active is None or not active.is_joint:
+        return
+    block = active.geometry.block
+    if limits.is_full(scene.rows(ACTIVE) if active.saved else scene.count(block), blocks=1):
+        found = scene.state(ACTIVE) if active.saved else None
+        state.active = None
+        scene.persist(scene.tree, {block: found, ACTIVE: found.nobody} if found else {}, state.to_json())

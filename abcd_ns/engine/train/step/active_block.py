@@ -173,7 +173,6 @@ class ActiveBlock:
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """What decides whether to refine, see `after_step`."""
         run, active = self._run, self._run.active
-        among_others = run.blocks > 1 and run.config.recipe.overlap == 0
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
@@ -182,6 +181,6 @@ class ActiveBlock:
             visit=active.steps * batch if active.kind is VisitKind.BLOCK else None,
             room=room,
             refined=self.clocks.refined,
-            first=among_others and self.clocks.visits == 0,
-            spent=active.done / active.steps if among_others else 0.0,
+            first=run.among_others and self.clocks.visits == 0,
+            spent=active.done / active.steps if run.among_others else 0.0,
         )
