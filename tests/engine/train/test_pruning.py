@@ -208,6 +208,17 @@ def test_few_views_ask_for_less():
     assert [density.for_views(n).min_contribution for n in (5, 12, 25, 500)] == [1.6, 3.84, 8.0, 8.0]
 
 
+@pytest.mark.parametrize(("blocks", "asked"), [(4, 30.0), (1, 60.0)])
+def test_where_memory_cuts_the_scene_half_of_the_minimum_is_asked(make, photos, blocks, asked):
+    left = []
+    for limit, minimum in ((1000, 60.0), (0, asked), (0, 90.0 - asked)):
+        options = {"block_limit": limit, "density": replace(STILL, min_contribution=minimum)}
+        coordinator = make(f"{limit}-{minimum}", blocks=blocks, steps=80, **options)
+        train(coordinator, photos)
+        left.append(len(whole_scene(coordinator)))
+    assert left[0] == left[1] != left[2]
+
+
 def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     coordinator = make(blocks=2, density=replace(STILL, min_contribution=1e-9), batch=1)
     batch, before = coordinator.next_batch(), whole_scene(coordinator)

@@ -198,13 +198,14 @@ class DensityControl:
         growth: dict[str, Tensor],
         progress: float,
         required: Float[Tensor, "n"] | float = 0.0,
+        part: float = 1.0,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's views, at a share of the run, or less than `required`
-        of it, px; floaters; and what is too faint for any picture to show, which nothing would train again.
-        Gives the block's statistics from now on."""
+        """Take out what fills too little of the block's views, at a share of the run, by this part of the
+        minimum, or less than `required`, px; floaters; and what is too faint for any picture to show, which
+        nothing would train again. Gives the block's statistics from now on."""
         if not self.config.prunes or not pruning.have_contributions(growth):
             return growth
-        bounds = self.config.min_contribution, pruning.FAINT
+        bounds = part * self.config.min_contribution, pruning.FAINT
         least, faint = (pruning.risen(bound, progress, self.config.refine_stop) for bound in bounds)
         opacities = torch.sigmoid(params["opacities"][:, 0])
         found = pruning.contributions(growth)

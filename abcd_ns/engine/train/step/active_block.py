@@ -26,6 +26,10 @@ LARGEST = "largest"
 FILLS = 0.01
 """Share of a block's views: oversized Gaussians that fill more are no accident."""
 
+CUT_BY_MEMORY = 0.5
+"""Part of the minimum contribution that is asked where memory cuts the scene. Its blocks are trained on fewer
+views than one block would be, and use less of what they have by then."""
+
 
 class ActiveBlock:
     """What is active in a run's parameters, with what density control has gathered of it."""
@@ -145,7 +149,8 @@ class ActiveBlock:
             trained_on = [run.views[view] for view in run.active.trained_on]
             least = pruning.veils(list(run.views.values()), *drawn)
             least = least.maximum(SHOWN * pruning.covered(trained_on, *drawn))
-        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, least)
+        part = CUT_BY_MEMORY if run.config.limits.block_limit and run.scene.tree.num_blocks > 1 else 1.0
+        self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, least, part)
         run.health.count("pruned", before - len(self))
         self._lower_degrees()
         self.growth = pruning.faded(self.growth)
