@@ -112,9 +112,6 @@ class HeldLight:
         """The transform of a view."""
         return self._transforms[view]
 
-    def step(self, gradients: Sequence[tuple[int, Tensor]], damping: float = 1.0) -> None:
-        """Nothing."""
-
 
 def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
     """A composited picture in a photo's light, M c + o in each pixel, not clamped."""
