@@ -172,7 +172,6 @@ def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:
 
 
 def _decode(path: Path, pixels: Callable[[Image.Image], np.ndarray]) -> np.ndarray:
-    """What `pixels` gives of a file's picture."""
     try:
         with open_picture(path) as picture:
             return pixels(picture)

@@ -188,7 +188,6 @@ class StoredScene(VisitScene):
         self._writer.check()
 
     def _sort(self, pending: BlockState | None) -> None:
-        """Sort the pending migrants by block."""
         before, self.pending, self._pending_by_block = self._pending_by_block, pending, {}
         if pending is not None and len(pending):
             self._pending_by_block = split_by_block(pending, self.tree.assign(pending.gaussians.means))
@@ -226,7 +225,6 @@ class StoredScene(VisitScene):
         self._active, self._sh_degree = (block, gaussians), sh_degree
 
     def clear_active(self) -> None:
-        """No block is active any more."""
         self._active = None
 
     # -- what is there -------------------------------------------------------------------------------

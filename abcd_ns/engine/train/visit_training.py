@@ -177,7 +177,6 @@ class VisitTraining:
 
     @property
     def degree(self) -> int:
-        """The degree of spherical harmonics in this step."""
         active = self.run.active
         changes = active.is_alone or self.run.config.recipe.sh_restart
         return self.run.sh_degree if changes else active.sh_degree

@@ -109,7 +109,6 @@ class HeldLight:
         self._transforms = {view: transform.to(device) for view, transform in transforms.items()}
 
     def of(self, view: int) -> Float[Tensor, "3 4"]:
-        """The transform of a view."""
         return self._transforms[view]
 
 
