@@ -71,9 +71,6 @@ class Photos:
         self._kept: LRUCache[_Key, Tensor] = LRUCache(self.budget_bytes, getsizeof=lambda kept: kept.nbytes)
         self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self.sources)
-
     @property
     def cached_bytes(self) -> int:
         """Of decoded pixels that are kept now."""

@@ -39,6 +39,7 @@ class BlockScene(Protocol):
 
     def count(self, block: int) -> int:
         """How many Gaussians the block has."""
+        return len(self.gaussians(block))
 
     def bounds(self, block: int) -> Box | None:
         """`bounds_of` the block's Gaussians."""
@@ -84,9 +85,6 @@ class MemoryScene(BlockScene):
 
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
-
-    def count(self, block: int) -> int:
-        return len(self._blocks[block])
 
     def bounds(self, block: int) -> Box | None:
         if block not in self._bounds:
