@@ -63,7 +63,7 @@ def read_stage(data: Path, downscale: int) -> Stage:
     pictures = []
     for outputs in (train, test):
         photos = Photos(outputs.metadata["photos"])
-        pictures.append([photos.image(row)[..., :3].float() / 255 for row in range(len(photos))])
+        pictures.append([photos.image(row)[..., :3].float() / 255 for row in range(len(photos.sources))])
     points = train.metadata.get("points3D_xyz")
     if points is None:
         raise UserError(f"{data} has no points to begin with.")

@@ -22,7 +22,7 @@ def check_installed() -> None:
         raise WorkersError("Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'.")
 
 
-def connect(address: str | None, *, cores: int, object_store_bytes: int | None = None) -> None:
+def connect(address: str | None, *, cores: int) -> None:
     """Join the cluster whose head is at `address` (host:port), or start one here for as long as we live.
 
     One that is started listens on 127.0.0.1 alone, and asks for a token that only its own processes know. A
@@ -37,7 +37,6 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
     options: dict[str, Any] = {"address": address}
     if address is None:
         options = {"num_cpus": cores, "include_dashboard": False, "_node_ip_address": LOOPBACK}
-        options["object_store_memory"] = object_store_bytes
     failed = f"No Ray cluster answers at {address}" if address else "No Ray could be started here"
     for left in reversed(range(1 if address else STARTS)):
         try:

@@ -105,7 +105,6 @@ class Dispatcher(Coordinator):
             super().pause()
 
     def resume(self) -> None:
-        """Time counts again, and workers go on."""
         self.workers.resume()
         super().resume()
 

@@ -156,7 +156,6 @@ class ForkedWorkers(Workers):
         return Lost(self._end(member).number, why)
 
     def _end(self, member: Place) -> Assignment:
-        """End its process, and its visit."""
         assignment = member.put_down()
         member.pipe.close()
         if os.getpid() == self._owner:  # a process that was forked meanwhile knows it, too

@@ -71,9 +71,6 @@ class Photos:
         self._kept: LRUCache[_Key, Tensor] = LRUCache(self.budget_bytes, getsizeof=lambda kept: kept.nbytes)
         self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self.sources)
-
     @property
     def cached_bytes(self) -> int:
         """Of decoded pixels that are kept now."""
@@ -172,7 +169,6 @@ def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:
 
 
 def _decode(path: Path, pixels: Callable[[Image.Image], np.ndarray]) -> np.ndarray:
-    """What `pixels` gives of a file's picture."""
     try:
         with open_picture(path) as picture:
             return pixels(picture)

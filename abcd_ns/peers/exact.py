@@ -28,7 +28,7 @@ from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.base import SUMS
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import front_to_back
-from abcd_ns.engine.space.visibility import Optics, reaches
+from abcd_ns.engine.space.visibility import Optics
 from abcd_ns.engine.store.coarse_model import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.density.growing import Judged
@@ -177,11 +177,10 @@ class ExactTrainer(Trainer):
         """(block, rows, Gaussians on the device) of every layer that holds any."""
         everything, tree = self._all.gaussians, self.scene.tree
         optics = Optics([sample.view for sample in self._batch.samples], self.run.rasterizer.slack)
-        owner, slack = self._owner_of_all(), optics.slack(everything.means)
-        shapes = everything.means, everything.scales
+        owner = self._owner_of_all()
         for block in range(tree.num_blocks):
-            inside = (owner == block) | reaches(*shapes, tree.cell(block), slack, optics.slant)
-            rows = inside.nonzero()[:, 0]
+            reached = optics.reaches(everything.means, everything.scales, tree.cell(block))
+            rows = ((owner == block) | reached).nonzero()[:, 0]
             if len(rows):
                 yield block, rows, everything[rows].to(self.device)
 

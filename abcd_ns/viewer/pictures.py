@@ -80,7 +80,7 @@ class BlockPictures:
     renderer: LayerRenderer
     view: View
     settings: RenderSettings
-    window_weight: float = 0.0  # see TrainingConfig: F and B are cut as training cuts them
+    window_weight: float = 0.0  # see Recipe: F and B are cut as training cuts them
 
     @torch.no_grad()
     def draw(self, show: Show, block: int | None) -> Raster:

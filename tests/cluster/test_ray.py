@@ -76,7 +76,9 @@ def traps(tmp_path_factory):
 def workers(steady, photos, traps):
     """Two real ones on a head of their own, for one run after the other."""
     try:
-        connect(None, cores=3, object_store_bytes=100 << 20)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(ray, "init", partial(ray.init, object_store_memory=100 << 20))
+            connect(None, cores=3)
     except WorkersError as error:
         if not any(words in str(error) for words in TOO_BUSY):
             raise

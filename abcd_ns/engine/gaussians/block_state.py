@@ -58,7 +58,6 @@ class Packed(NamedTuple):
         return Packed(chosen, self.meta)
 
     def part(self, names: set[str]) -> "Packed":
-        """Some columns."""
         return Packed({name: value for name, value in self.tensors.items() if name in names}, self.meta)
 
 

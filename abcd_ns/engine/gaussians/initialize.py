@@ -53,7 +53,6 @@ class PointCloud:
         return {name: getattr(self, name) for name in ("means", "scales", "quats", "features_dc")}
 
     def gaussians(self) -> Gaussians:
-        """One at each point."""
         count, scales = len(self), self.scales.repeat(1, 3)
         if self.flat:
             scales[:, 2] = THICKNESS

@@ -19,7 +19,7 @@ from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
-from abcd_ns.engine.space.visibility import Frusta, Optics, reaches, shared, straddles
+from abcd_ns.engine.space.visibility import Frusta, Optics, shared
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
@@ -176,14 +176,12 @@ class LayerRenderer:
 
     def _straddlers(self, optics: Optics, block: int) -> Gaussians:
         """A block's Gaussians that some view may see outside its cell."""
-        cell = self.tree.cell(block)
-        which = lambda *shapes: straddles(*shapes, cell, optics.slack(shapes[0]), optics.slant)  # noqa: E731
-        return self.scene.drawn(block, "cpu", which)
+        return self.scene.drawn(block, "cpu", partial(optics.straddles, box=self.tree.cell(block)))
 
     @staticmethod
     def _reach_in(box: Box, optics: Optics, straddlers: Callable[[int], Gaussians], block: int) -> Gaussians:
         found = straddlers(block)
-        return found[reaches(found.means, found.scales, box, optics.slack(found.means), optics.slant)]
+        return found[optics.reaches(found.means, found.scales, box)]
 
     def render(
         self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings, active: int

@@ -35,11 +35,9 @@ class Kept:
 
     @property
     def nbytes(self) -> int:
-        """Its size."""
         return sum(self.sizes)
 
     def moved(self, move: Callable[[Tensor], Tensor]) -> "Kept":
-        """The same somewhere else."""
         return Kept(move(self.layers), self.interleaved and Splats(move(self.interleaved.planes)))
 
 

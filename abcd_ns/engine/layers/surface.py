@@ -24,22 +24,17 @@ NEARER = 0.85
 """Of the view's nearest point: Gaussians with a smaller camera z are fog."""
 
 
-def normals_of(gaussians: Gaussians, center: Float[Tensor, "3"], flat: bool) -> Float[Tensor, "n 3"]:
-    """Unit vectors across Gaussians, or across surfels if `flat`; world space, on the side of a camera's
-    centre."""
+def colored_by_normal(gaussians: Gaussians, view: View, flat: bool) -> Gaussians:
+    """The same in the colours (n + 1) / 2, for unit normals across them, or across surfels if `flat`; world
+    space, on the side of the view. Any rasterizer draws them, with harmonics of degree 0, and any layers
+    fold; `normals_in` makes normals of the picture."""
     found = own_axes(*F.normalize(gaussians.quats, dim=1).unbind(1))
     axes = torch.stack([torch.stack(axis, dim=1) for axis in found], dim=1)
     which = gaussians.scales.argmin(dim=1)
     which = torch.full_like(which, UPRIGHT) if flat else which
     normals = axes[torch.arange(len(which), device=which.device), which]
-    away = ((gaussians.means - center.to(gaussians.means)) * normals).sum(dim=1, keepdim=True)
-    return torch.where(away > 0, -normals, normals)
-
-
-def colored_by_normal(gaussians: Gaussians, view: View, flat: bool) -> Gaussians:
-    """The same in the colours (n + 1) / 2, for normals that face the view. Any rasterizer draws them, with
-    harmonics of degree 0, and any layers fold; `normals_in` makes normals of the picture."""
-    shown = normals_of(gaussians, view.center, flat) / (2 * SH_C0)
+    away = ((gaussians.means - view.center.to(gaussians.means)) * normals).sum(dim=1, keepdim=True)
+    shown = torch.where(away > 0, -normals, normals) / (2 * SH_C0)
     return replace(gaussians, features_dc=shown, features_rest=torch.zeros_like(gaussians.features_rest))
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from statistics import median
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.types import NEAR_PLANE, View, centers_of
@@ -35,7 +35,8 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
         points: of the sparse reconstruction, world units.
         near: from where on they see, world units; 0 takes half the nearest distance of a point in any view.
     """
-    points, extent = _some(points), _extent(views)
+    points = points[:: -(-len(points) // MOST_POINTS) or 1].double()
+    extent = _extent(views)
     found: dict[int, tuple[float, float]] = {}
     for view in views:
         depths, seen = replace(view, near=0.0).depths_of(points)
@@ -50,11 +51,6 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
         replace(view, near=near, nearest=nearest, reach=min(extent, FARTHER * distance))
         for view, nearest, distance in known
     ]
-
-
-def _some(points: Float[Tensor, "n 3"]) -> Float64[Tensor, "m 3"]:
-    """At most MOST_POINTS of them."""
-    return points[:: -(-len(points) // MOST_POINTS) or 1].double()
 
 
 def _extent(views: Sequence[View]) -> float:

@@ -152,7 +152,6 @@ class InfluenceTable:
 
 
 def _put(influence: Influence, view: int, row: Sequence[float]) -> None:
-    """What a view shows of each block."""
     for block, value in enumerate(row):
         if share := round(value, DIGITS):
             influence.setdefault(block, {})[view] = share

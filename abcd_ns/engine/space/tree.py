@@ -128,7 +128,6 @@ class BlockTree:
         return block[node].to(points.device)
 
     def node_of(self, block: int) -> int:
-        """The leaf of a block."""
         if block not in self._leaf_of:
             raise ValueError(f"block {block} does not exist: the tree has blocks 0 to {self.num_blocks - 1}")
         return self._leaf_of[block]

@@ -68,38 +68,6 @@ def widest_slant(views: Sequence[View]) -> float:
     return float((1 + limits.square().sum(dim=1)).sqrt().max())
 
 
-def reaches(
-    means: Float[Tensor, "n 3"],
-    scales: Float[Tensor, "n 3"],
-    box: Box,
-    slack: Float[Tensor, "n"],
-    slant: float,
-) -> Bool[Tensor, "n"]:
-    """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
-
-    True where the distance from the mean to the box is at most slant * reach_radius + slack.
-
-    Args:
-        slack: what the screen adds, world units: its blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a
-            tile's diagonal, as a fragment's place is looked up on the ray through the middle of its tile.
-        slant: the `widest_slant` of the views in question.
-    """
-    outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
-    return outside.norm(dim=1) <= slant * reach_radius(scales) + slack
-
-
-def straddles(
-    means: Float[Tensor, "n 3"],
-    scales: Float[Tensor, "n 3"],
-    box: Box,
-    slack: Float[Tensor, "n"],
-    slant: float,
-) -> Bool[Tensor, "n"]:
-    """Whether any fragment of each Gaussian may lie outside `box`; see `reaches`."""
-    inside = torch.minimum(means - box.lower.to(means), box.upper.to(means) - means).amin(dim=1)
-    return ~(inside > slant * reach_radius(scales) + slack)
-
-
 def bounds_of(gaussians: Gaussians) -> Box | None:
     """A box that holds the means and, but for the screen's slack, all that any view may draw of them.
 
@@ -207,6 +175,28 @@ class Optics:
         """What the screen adds to the reach of Gaussians with these means, as the farthest camera would see
         it; world units."""
         return ((means - self._middle.to(means)).norm(dim=1) + self._spread) * self._angle
+
+    def reaches(
+        self, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"], box: Box
+    ) -> Bool[Tensor, "n"]:
+        """Whether any fragment of each Gaussian may lie in `box`, from any of the views: False is certain.
+
+        True where the distance from the mean to the box is at most slant * reach_radius + slack. The slack is
+        the screen's blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a tile's diagonal, as a fragment's
+        place is looked up on the ray through the middle of its tile.
+        """
+        outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
+        return outside.norm(dim=1) <= self._reach(means, scales)
+
+    def straddles(
+        self, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"], box: Box
+    ) -> Bool[Tensor, "n"]:
+        """Whether any fragment of each Gaussian may lie outside `box`; see `reaches`."""
+        inside = torch.minimum(means - box.lower.to(means), box.upper.to(means) - means).amin(dim=1)
+        return ~(inside > self._reach(means, scales))
+
+    def _reach(self, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        return self.slant * reach_radius(scales) + self.slack(means)
 
     def drawn_within(self, bounds: Sequence[Box]) -> Float64[Tensor, "n 2 3"]:
         """Where fragments of Gaussians with these bounds may lie, whatever the view; the slack included.

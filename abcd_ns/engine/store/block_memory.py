@@ -37,7 +37,6 @@ class BlockMemory:
             self._training[name] = block.part(training)
 
     def forget(self, name: BlockName) -> None:
-        """Let a block go."""
         for kept in (self._drawn, self._training):
             kept.pop(name, None)
 

@@ -56,18 +56,18 @@ def commit(
     left = state[~inside] if migrate else state.nobody
     if taken is not None and (migrants := scene.pending_for(block)) is not None:
         left = join([left, migrants[taken:]])
-    return {block: state[inside], **pending_without(scene, {block}, left)}
+    return {block: state[inside], **pending_without(scene, block, left)}
 
 
 def pending_without(
-    scene: StoredScene, blocks: set[int], arrivals: BlockState | None = None
+    scene: StoredScene, block: int, arrivals: BlockState | None = None
 ) -> dict[BlockName, BlockState]:
-    """The pending migrants without those of these blocks and with arrivals, if that changes them."""
+    """The pending migrants without those of a block and with arrivals, if that changes them."""
     parts = [arrivals] if arrivals else []
-    if not parts and all(scene.pending_for(block) is None for block in blocks):
+    if not parts and scene.pending_for(block) is None:
         return {}
     if scene.pending is not None:
-        parts.insert(0, without(scene, scene.pending, blocks))
+        parts.insert(0, without(scene, scene.pending, [block]))
     return {PENDING: replace(join(parts), clocks=Clocks())}
 
 

@@ -120,7 +120,6 @@ class ParameterStore:
 
     @property
     def pins(self) -> list[str]:
-        """The names of the pinned generations."""
         return pin_names(self.folder)
 
     def counts(self, block: BlockName) -> int:
@@ -197,7 +196,6 @@ class ParameterStore:
         self._collect()
 
     def unpin(self, name: str) -> None:
-        """Let the generation pinned under `name` go."""
         self._require_writable()
         path = manifest_path(self.folder, name)
         try:

@@ -39,6 +39,7 @@ class BlockScene(Protocol):
 
     def count(self, block: int) -> int:
         """How many Gaussians the block has."""
+        return len(self.gaussians(block))
 
     def bounds(self, block: int) -> Box | None:
         """`bounds_of` the block's Gaussians."""
@@ -84,9 +85,6 @@ class MemoryScene(BlockScene):
 
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
-
-    def count(self, block: int) -> int:
-        return len(self._blocks[block])
 
     def bounds(self, block: int) -> Box | None:
         if block not in self._bounds:
@@ -188,7 +186,6 @@ class StoredScene(VisitScene):
         self._writer.check()
 
     def _sort(self, pending: BlockState | None) -> None:
-        """Sort the pending migrants by block."""
         before, self.pending, self._pending_by_block = self._pending_by_block, pending, {}
         if pending is not None and len(pending):
             self._pending_by_block = split_by_block(pending, self.tree.assign(pending.gaussians.means))
@@ -226,7 +223,6 @@ class StoredScene(VisitScene):
         self._active, self._sh_degree = (block, gaussians), sh_degree
 
     def clear_active(self) -> None:
-        """No block is active any more."""
         self._active = None
 
     # -- what is there -------------------------------------------------------------------------------

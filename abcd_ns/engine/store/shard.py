@@ -45,19 +45,16 @@ def verify_shard(path: Path, shard: Shard) -> None:
 
 def read_shard(path: Path, names: Iterable[str] | None) -> dict[str, Tensor]:
     """The tensors of these names, or all, on the CPU. Raises OSError or SafetensorError."""
-    with _opened(path) as file:
-        wanted = sorted(file.keys()) if names is None else names
-        # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
-        return {name: file.get_tensor(name).clone() for name in wanted}
-
-
-def _opened(path: Path) -> safe_open:
     try:
-        return safe_open(path, framework="pt", device="cpu")
+        file = safe_open(path, framework="pt", device="cpu")
     except RuntimeError as error:  # torch maps the file, and has no OSError of its own
         if not path.exists():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from error
         raise OSError(str(error)) from error
+    with file:
+        wanted = sorted(file.keys()) if names is None else names
+        # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
+        return {name: file.get_tensor(name).clone() for name in wanted}
 
 
 def link_or_copy(source: Path, target: Path) -> None:

@@ -67,7 +67,7 @@ class Coordinator(Trainer):
         if self.poses is not None and self.poses.is_due:
             self.poses.take()
         if self.state.active is None:
-            self.begin_visit()
+            self._attach(self.visits.begin())
         return self.visit.next_batch()
 
     def render(self, batch: Batch) -> Rendered:
@@ -90,9 +90,6 @@ class Coordinator(Trainer):
     def finished(self) -> bool:
         """Whether the budget is used up, and no block is active."""
         return self.state.active is None and super().finished
-
-    def begin_visit(self) -> None:
-        self._attach(self.visits.begin())
 
     def _attach(self, active: ActiveVisit) -> None:
         self.visit.attach(active)

@@ -72,7 +72,11 @@ class Health:
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped, with the mean squared error of each picture that the step drew.
         Gives whether its gradients were all numbers, as far as known, and its PSNR, dB; see StepTaken."""
-        self._send(errors)
+        parts = {"shares": self._shares, "errors": list(errors)}
+        self._shares = []
+        if self._guard is not None:
+            parts["bad"], self._guard.found = self._guard.found, []
+        self._numbers.send(parts)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
             self._clean += 1
@@ -181,14 +185,6 @@ class Health:
         adam = self._optimizers[name].state[self._params[name]]
         for moment in MOMENTS:
             adam[moment][rows] = 0.0
-
-    def _send(self, errors: Sequence[Float[Tensor, ""]]) -> None:
-        """All that the step tells, as one small tensor."""
-        shares, self._shares = self._shares, []
-        parts = {"shares": shares, "errors": list(errors)}
-        if self._guard is not None:
-            parts["bad"], self._guard.found = self._guard.found, []
-        self._numbers.send(parts)
 
     def _read(self, all_but: int = 0) -> None:
         """Take note of what steps told, but for the last so many."""

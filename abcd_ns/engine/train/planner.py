@@ -170,7 +170,7 @@ class Planner(Visits):
         run, scene = self._run, self._scene
         if not run.limits.is_full(scene.count(block), scene.tree.num_blocks):
             return False
-        large = {block: with_pending(scene, block), **pending_without(scene, {block})}
+        large = {block: with_pending(scene, block), **pending_without(scene, block)}
         tree, parts, parents = cut_full(scene, large, run.state, run.limits)
         for new, parent in parents.items():
             run.announce(BlockSplit(parent, new))

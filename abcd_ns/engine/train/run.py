@@ -112,7 +112,6 @@ class TrainingRun:
 
     @property
     def sh_degree(self) -> int:
-        """The degree of spherical harmonics in use."""
         active = self.state.active
         restarts = self.config.recipe.sh_restart and active is not None and not active.is_joint
         share = active.done / active.steps if restarts else self.share

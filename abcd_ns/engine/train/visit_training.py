@@ -14,7 +14,7 @@ from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train import schedule
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, Light
 from abcd_ns.engine.train.density.pruning import PASSES, with_blend_weights
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
@@ -140,7 +140,7 @@ class VisitTraining:
 
     def _adapt_light(self, rendered: Rendered) -> None:
         run = self.run
-        if run.light is None:
+        if not isinstance(run.light, Light):
             return
         damping = schedule.exponential_decay(run.progress, LAST_RATE)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
@@ -177,7 +177,6 @@ class VisitTraining:
 
     @property
     def degree(self) -> int:
-        """The degree of spherical harmonics in this step."""
         active = self.run.active
         changes = active.is_alone or self.run.config.recipe.sh_restart
         return self.run.sh_degree if changes else active.sh_degree

@@ -23,8 +23,6 @@ from abcd_ns.engine.space.visibility import (
     Optics,
     bounds_of,
     footprint,
-    reaches,
-    widest_slant,
 )
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
@@ -105,8 +103,7 @@ def drawn_and_reached(seed: int, count: int, crop: Crop | None, lower: float, up
     splats = TorchRasterizer(use_native=False).project(gaussians, view)
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle + lower, torch.tensor(upper).double() + middle)
-    blur = splats.depths.clamp(min=0) * SPLATS.blur_pixels / view.K.diagonal()[:2].min()
-    reached = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant([view]))
+    reached = Optics([view], SPLATS.blur_pixels).reaches(gaussians.means, gaussians.scales, box)
     return drawn_in_box(view, crop or view.full, box, splats), reached
 
 

@@ -197,7 +197,7 @@ def test_where_no_influence_is_known_no_view_is_doubtful(tmp_path):
     views = [view if view.index % 2 else replace(view, viewmat=ring_of_views(1)[0].viewmat) for view in aside]
     run = make_coordinator(tmp_path, random_gaussians(200, size=0.3), views, blocks=2, steps=400)
     for _ in range(2):
-        run.begin_visit()
+        run.next_batch()
         assert run.state.active.looked_at == ()
         run.end_visit()
     assert run.state.influence == {}

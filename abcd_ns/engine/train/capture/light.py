@@ -109,11 +109,7 @@ class HeldLight:
         self._transforms = {view: transform.to(device) for view, transform in transforms.items()}
 
     def of(self, view: int) -> Float[Tensor, "3 4"]:
-        """The transform of a view."""
         return self._transforms[view]
-
-    def step(self, gradients: Sequence[tuple[int, Tensor]], damping: float = 1.0) -> None:
-        """Nothing."""
 
 
 def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:

@@ -58,7 +58,6 @@ class Sample:
 
     @property
     def shot(self) -> Shot:
-        """What the rasterizer is to draw."""
         inside = None if self.layers is None else self.layers.inside
         return Shot(self.view, self.crop, inside, None if inside is None else self.window)
 
@@ -169,7 +168,6 @@ class Rendered:
 
     @staticmethod
     def joined(parts: Sequence["Rendered"]) -> "Rendered":
-        """Of a step that was drawn in parts."""
         names = [field.name for field in fields(Rendered)]
         return Rendered(*(tuple(chain(*(getattr(part, name) for part in parts))) for name in names))
 

@@ -178,5 +178,5 @@ class FinalPruning:
             state = with_pending(scene, block)
             stays = state.deferred.clone()  # what is not drawn
             stays[~state.deferred] = worth > least
-            run.persist(scene.tree, {block: state[stays], **pending_without(scene, {block})}, within=0.0)
+            run.persist(scene.tree, {block: state[stays], **pending_without(scene, block)}, within=0.0)
         return gone

@@ -38,7 +38,6 @@ class PoseRounds:
 
     @property
     def is_due(self) -> bool:
-        """Whether poses should be refined now."""
         state = self._run.state
         if state.active is not None and not state.active.is_alone:
             return False
@@ -47,7 +46,6 @@ class PoseRounds:
         return state.uses - state.posed >= max(EVERY, SHARE * state.uses)
 
     def take(self) -> None:
-        """Take a step for the pose of each view."""
         run, views = self._run, self._whole.views()
         steps: dict[int, Tensor] = {}
         scene = run.scene
