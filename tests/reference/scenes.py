@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import UnionType
 from typing import Any
 
@@ -30,7 +30,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import look_at
 
@@ -191,11 +191,32 @@ def assert_same_state(one: BlockState, other: BlockState) -> None:
     assert one.clocks == other.clocks
 
 
-def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:
-    """A list of the events of this kind, which grows as they happen."""
+def listen(trainer: Trainer, kind: type | UnionType, note: Callable = lambda event: event) -> list[Any]:
+    """A list of the events of this kind, or of what `note` makes of each, which grows as they happen."""
     heard: list[Any] = []
-    trainer.announce.subscribe(lambda event: heard.append(event) if isinstance(event, kind) else None)
+    trainer.announce.subscribe(lambda event: heard.append(note(event)) if isinstance(event, kind) else None)
     return heard
+
+
+def steps_of(trainer: Trainer, photos: Callable) -> Iterator[int]:
+    """Train until the budget is used up; the steps so far, after each."""
+    while not trainer.finished:
+        train_step(trainer, photos)
+        yield trainer.state.step
+
+
+def spoil_gradients(trainer: Trainer, name: str, row: int, value: float, at: int | None = None) -> None:
+    """The row's gradient of one parameter is `value` in every step, or after `at` of them: a hook that runs
+    before all others."""
+    optimizer = trainer.optimizers[name]
+
+    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
+        gradient = optimizer.param_groups[0]["params"][0].grad
+        if gradient is not None and len(gradient) > row and at in (None, trainer.state.step):
+            gradient[row] = value
+
+    handle = optimizer.register_step_pre_hook(spoil)
+    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
 
 
 def stop(trainer: Trainer) -> None:
