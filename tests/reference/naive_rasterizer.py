@@ -119,16 +119,9 @@ def _splats(
     R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
     center = -R.T @ t
     means_c = [R @ g.means[i] + t for i in range(len(g))]
-    projected = [
-        (view.K @ (m if m[2] > 0.01 else torch.ones_like(m)))[:2] / (m[2] if m[2] > 0.01 else 1)
-        for m in means_c
-    ]
-    means2d = torch.stack(projected) if projected else g.means.new_zeros((0, 2))
+    means2d = torch.stack([(view.K @ mean)[:2] / mean[2] for mean in means_c])
     splats = []
     for i in range(len(g)):
-        if not 0.01 <= means_c[i][2].item() <= 1e10:
-            splats.append(None)
-            continue
         found = _project(g, i, means2d[i], means_c[i], view, antialiased)
         if surfels:
             found = _project_surfel(g, i, means_c[i], view)
@@ -178,7 +171,8 @@ def naive_rasterize(
     antialiased: bool = False,
     primitive: str = "3dgs",
 ) -> NaiveRaster:
-    """Draw in float64. `near` and `far` [h, w] are the z window, of the frozen if any, else of all."""
+    """Draw what is before the camera in float64. `near` and `far` [h, w] are the z window, of the frozen if
+    any, else of all."""
     crop = crop or view.full
     options = (sh_degree, antialiased)
     own_window, surfels = near is not None and frozen is None, primitive == "2dgs"
@@ -186,7 +180,7 @@ def naive_rasterize(
     everyone = list(own)
     if frozen is not None:
         everyone += _splats(frozen.detach(), view, *options, near is not None, surfels)[1]
-    drawable = [s for s in everyone if s is not None and s.radius > 0]
+    drawable = [s for s in everyone if s.radius > 0]
     drawable.sort(key=lambda s: s.depth.item())  # stable: ties by index
     pixels = []
     for row in range(crop.height):
@@ -196,5 +190,5 @@ def naive_rasterize(
             )
             pixels.append(_pixel(drawable, crop.x + col, crop.y + row, low, high))
     color, T, depth = (torch.stack([p[k] for p in pixels]) for k in range(3))
-    size, radii = (crop.height, crop.width), [0 if s is None else s.radius for s in own]
+    size, radii = (crop.height, crop.width), [s.radius for s in own]
     return NaiveRaster(color.view(*size, 3), T.view(size), depth.view(size), means2d, radii)

@@ -16,14 +16,15 @@ from tests.reference.scenes import activated, random_gaussians
 
 def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
-    params, adam = activated(random_gaussians(1))
-    pace, before = Pace(adam, fast_start=False), {name: params[name].detach().clone() for name in PARAM_NAMES}
+    before = random_gaussians(1)
+    params, adam = activated(before)
+    pace = Pace(adam, fast_start=False)
     for _ in range(steps):
         pace.set(views, 0, means_decay=1.0)
         for name in PARAM_NAMES:
             params[name].grad = torch.ones_like(params[name])
             adam[name].step()
-    return {name: float((params[name].detach() - before[name]).abs().max()) for name in PARAM_NAMES}
+    return {name: float((params[name].detach() - value).abs().max()) for name, value in before.items()}
 
 
 @given(views=st.integers(1, 16))
@@ -34,7 +35,7 @@ def test_views_that_agree_come_as_far_together_as_one_by_one(views):
 
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
-    ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 2, 4), (2_000, 4, 4), (10_000, 1, 1)]
+    ("views", "batch", "times"), [(0, 2, 4), (2_500, 1, 2), (2_000, 4, 4), (10_000, 1, 1)]
 )
 def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times, late):
     """And harmonics that come late larger ones still."""
