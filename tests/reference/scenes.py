@@ -12,6 +12,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, attach, nothing_active
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -84,6 +85,15 @@ class WatchedScene(MemoryScene):
     def drawn(self, block: int, *given: Any) -> Gaussians:
         self.read.append(block)
         return super().drawn(block, *given)
+
+
+def renderer_of(
+    scene: Gaussians | MemoryScene, draw: Rasterizer, blocks: int = 4, **options
+) -> LayerRenderer:
+    """Of a scene, or of Gaussians cut into blocks; by fragments and block by block unless told otherwise."""
+    if isinstance(scene, Gaussians):
+        scene = MemoryScene(build_kd(scene.means, blocks), scene)
+    return LayerRenderer(scene, draw, **{"ownership": "fragments", "pass_gaussians": 0, **options})
 
 
 class Photos:

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
+from abcd_ns.engine.layers.layer_renderer import RenderSettings, Seen
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.projection import SPLATS, Splats, extents_of
 from abcd_ns.engine.render.z_window import TileGrid
@@ -26,11 +26,10 @@ from abcd_ns.engine.space.visibility import (
     reaches,
     widest_slant,
 )
-from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import NEAR_PLANE, Crop, View
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.rasterizer_scenes import assert_same_layer
-from tests.reference.scenes import WatchedScene, random_gaussians, ring_of_views
+from tests.reference.scenes import WatchedScene, random_gaussians, renderer_of, ring_of_views
 
 
 def small_view(seed: int = 0) -> View:
@@ -251,7 +250,7 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
     views = ring_of_views(3, dtype=torch.float64)  # around the first cluster
     tree = build_kd(gaussians.means, 8)
     scene = WatchedScene(tree, gaussians)
-    renderer = LayerRenderer(scene, DRAW, ownership=ownership, pass_gaussians=0)
+    renderer = renderer_of(scene, DRAW, ownership=ownership)
     for view in views:
         assert_same_layer(renderer.picture(view, SETTINGS), DRAW(gaussians, view, sh_degree=1), atol=1e-12)
     assert len(set(scene.read)) < 8
@@ -259,9 +258,11 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
 
 
 def test_few_parts_are_held_while_nodes_are_folded():
-    gaussians, (view,) = random_gaussians(128), ring_of_views(1)
-    scene, seen = MemoryScene(build_kd(gaussians.means, 32), gaussians), Seen(view, view.full)
-    renderer, parts, most = LayerRenderer(scene, DRAW, ownership="means", pass_gaussians=0), {}, 0
+    (view,), parts, most = ring_of_views(1), {}, 0
+    seen, renderer = (
+        Seen(view, view.full),
+        renderer_of(random_gaussians(128), DRAW, blocks=32, ownership="means"),
+    )
     for node, shown in renderer.shown(renderer.nodes(0), [(view, view.full)], exclude=0).items():
         (parts[node],) = renderer.render(node, renderer.load(shown), [seen], SETTINGS, 0)
         renderer.fold_up(parts, node, seen)
