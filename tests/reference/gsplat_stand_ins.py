@@ -167,8 +167,7 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
         return (torch.where(masks[0][..., None], colors, torch.nan) if masks else colors,)
 
     tensors = (dirs, coeffs) if masks is None else (dirs, coeffs, masks)
-    tensors = (tensor.contiguous() for tensor in tensors)
-    return Differentiable.apply(_harmonics, *tensors)[0]
+    return Differentiable.apply(_harmonics, *(tensor.contiguous() for tensor in tensors))[0]
 
 
 @stands_in(packed=True)
