@@ -108,11 +108,6 @@ def _project_surfel(g: Gaussians, i: int, mean_c: Tensor, view: View) -> tuple:
     return middle, sigma, opacity, math.ceil(3 * math.sqrt(max(1e-4, extent)))
 
 
-def _in_image(middle: Tensor, radius: int, view: View) -> bool:
-    size = (view.width, view.height)
-    return all(-radius < x < side + radius for x, side in zip(middle.tolist(), size, strict=True))
-
-
 def _splats(
     g: Gaussians, view: View, sh_degree: int, antialiased: bool, windowed: bool, surfels: bool
 ) -> tuple[Tensor, list[_Splat]]:
@@ -126,7 +121,9 @@ def _splats(
         if surfels:
             found = _project_surfel(g, i, means_c[i], view)
         middle, sigma, opacity, radius = found
-        radius = radius if _in_image(middle, radius, view) else 0
+        (x, y), (width, height) = middle.tolist(), (view.width, view.height)
+        if not (-radius < x < width + radius and -radius < y < height + radius):
+            radius = 0
         color = sh_color(g.features_dc[i], g.features_rest[i], g.means[i] - center, sh_degree)
         splats.append(_Splat(middle, sigma, opacity, color, means_c[i][2], radius, windowed))
     return means2d, splats
@@ -134,11 +131,10 @@ def _splats(
 
 def _touches_tile(splat: _Splat, px: int, py: int) -> bool:
     """Whether the square of the radius touches the 16 px tile that holds the pixel."""
-    for center, pixel in zip(splat.mean.tolist(), (px, py), strict=True):
-        tile = pixel // 16
-        if not math.floor((center - splat.radius) / 16) <= tile < math.ceil((center + splat.radius) / 16):
-            return False
-    return True
+    return all(
+        math.floor((center - splat.radius) / 16) <= pixel // 16 < math.ceil((center + splat.radius) / 16)
+        for center, pixel in zip(splat.mean.tolist(), (px, py), strict=True)
+    )
 
 
 def _pixel(splats: list[_Splat], px: int, py: int, near: float, far: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,6 @@
 """What a step on a device waits for and copies, and what it tells a step late."""
 
 import math
-from unittest import mock
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 from abcd_ns.engine.train.health import LATE_AFTER, widest
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop
-from tests.reference.device_counts import Counts
 from tests.reference.rasterizer_scenes import as_leaves
 from tests.reference.scenes import (
     STILL,
@@ -31,38 +29,17 @@ from tests.reference.simulated_device import DEVICE
 GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0)
 
 
-def steps_alone(coordinator, photos, counts: Counts) -> list[Counts]:
-    """What is counted in each step, but for visits' beginnings and ends."""
-    found, edges = [], []
-
-    def noting(method):
-        def noted(*args):
-            before = counts.copy()
-            result = method(*args)
-            edges.append(counts.since(before))
-            return result
-
-        return noted
-
-    noted = {name: noting(getattr(coordinator, name)) for name in ("begin_visit", "end_visit")}
-    with mock.patch.multiple(coordinator, **noted):
-        while not coordinator.finished:
-            edges.clear()
-            before = counts.copy()
-            train_step(coordinator, photos)
-            taken = counts.since(before)
-            for edge in edges:
-                taken = taken.since(edge)
-            found.append(taken)
-    return found
-
-
 @pytest.mark.parametrize("parts", [0, 300])
 def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
-    coordinator = on_device(blocks=4, steps=12, density=GATHERING, crop_pixels=parts)
-    _, *later = steps_alone(coordinator, photos, simulated_gsplat)  # the first uploads cameras, too
-    for taken in later:
+    coordinator, counted = on_device(blocks=4, steps=24, density=GATHERING, crop_pixels=parts), []
+    while not coordinator.finished:
+        active, before = coordinator.state.active, simulated_gsplat.copy()
+        train_step(coordinator, photos)
+        if active is not None and coordinator.state.active is active:  # no visit began or ended
+            counted.append(simulated_gsplat.since(before))
+    assert len(counted) > 8
+    for taken in counted:
         apart = taken.waits.pop("isect_tiles")
         assert apart == 1
         assert dict(+taken.waits) in ({}, {"event": 1})
