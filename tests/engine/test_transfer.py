@@ -31,17 +31,10 @@ def test_apples_device_has_no_float64():
     assert found == [torch.float64, torch.float64, torch.float32]
 
 
-class Event:
-    """As torch.mps has it."""
-
-    def record(self) -> None: ...
-
-    def synchronize(self) -> None: ...
-
-
 def test_a_device_whose_stream_has_no_name_is_copied_from_too(monkeypatch):
-    monkeypatch.setattr("abcd_ns.engine.transfer.event_of", lambda _: Event)
-    monkeypatch.setattr(torch, "get_device_module", lambda _: SimpleNamespace(Event=Event))
+    event = SimpleNamespace(record=lambda: None, synchronize=lambda: None)  # as torch.mps has it
+    monkeypatch.setattr("abcd_ns.engine.transfer.event_of", lambda _: lambda: event)
+    monkeypatch.setattr(torch, "get_device_module", lambda _: SimpleNamespace(Event=lambda: event))
     numbers = StepNumbers(torch.device("cpu"))
     numbers.send({"errors": list(torch.arange(3.0))})
     assert list(numbers.read()) == [{"errors": [0.0, 1.0, 2.0]}]

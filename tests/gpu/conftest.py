@@ -11,6 +11,9 @@ import torch
 
 from abcd_ns.engine.render import Rasterizer, TorchRasterizer, make_rasterizer
 from abcd_ns.engine.render.projection import PRIMITIVES
+from tests.engine.conftest import make, photos, start
+
+__all__ = ["device", "make", "photos", "rasterizer", "rasterizers", "start"]
 
 
 @pytest.fixture(scope="session")

@@ -28,11 +28,7 @@ CROPS = [None, Crop(16, 32, 64, 48), Crop(37, 5, 70, 61)]
 @pytest.fixture
 def scene(device):
     """Makes a scene of n Gaussians on the device."""
-
-    def make(n: int, seed: int = 0) -> Gaussians:
-        return random_gaussians(n, seed, dtype=torch.float32).to(device)
-
-    return make
+    return lambda n, seed=0: random_gaussians(n, seed, dtype=torch.float32).to(device)
 
 
 def view() -> View:
@@ -109,12 +105,6 @@ def test_nothing_to_draw(rasterizer, scene, device):
         assert (raster.transmittance == 1).all()
 
 
-def thin(gaussians: Gaussians) -> Gaussians:
-    """So faint that drawing stops nowhere: parts of a picture then add up to the whole."""
-    gaussians.opacities[:] -= 4.0
-    return gaussians
-
-
 @pytest.mark.parametrize("crop", CROPS)
 def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
     gaussians, seen = scene(100), [Shot(view(), crop or view().full)]
@@ -129,8 +119,9 @@ def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
 
 @pytest.mark.parametrize("crop", CROPS)
 def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(rasterizer, scene, crop, device):
-    everyone, crop = thin(scene(300)), crop or view().full
-    active, frozen = everyone[torch.arange(100)], everyone[torch.arange(100, 300)]
+    everyone, crop = scene(300), crop or view().full
+    everyone.opacities[:] -= 4.0  # so faint that drawing stops nowhere: parts then add up to the whole
+    active, frozen = everyone[:100], everyone[100:]
     window = next(rasterizer.depth_windows(active, [Shot(view(), crop)], visible=0.0))
     every = ZWindow.everything(window.grid, device, torch.float32)
     shot = CutShot(view(), crop, *every.cut_by(window))

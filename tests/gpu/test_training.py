@@ -4,6 +4,7 @@ Nothing is compared bit for bit: gsplat's backward pass adds up in no fixed orde
 """
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -19,9 +20,9 @@ from tests.reference.scenes import (
     STILL,
     Photos,
     listen,
-    make_coordinator,
     random_gaussians,
     ring_of_views,
+    spoil_gradients,
     stop,
     whole_scene,
 )
@@ -35,22 +36,12 @@ def views():
     return ring_of_views(5, width=96, height=72)
 
 
-@pytest.fixture(scope="module")
-def photos(views):
-    return Photos(random_gaussians(150, seed=7, size=0.12), views)
-
-
 @pytest.fixture
-def begin(rasterizer, device, views):
-    """Makes a coordinator on the device, in a folder of its own."""
-
-    def make(folder, **options):
-        folder.mkdir(exist_ok=True)
-        start = random_gaussians(300, seed=1, size=0.12)
-        given = {"steps": STEPS, "background": "black", "rasterizer": rasterizer, "device": device}
-        return make_coordinator(folder, start, views, **{**given, **options})
-
-    return make
+def begin(make, rasterizer, device):
+    """Makes runs on the device."""
+    start = random_gaussians(300, seed=1, size=0.12)
+    options = {"steps": STEPS, "background": "black", "rasterizer": rasterizer, "device": device}
+    return partial(make, start=start, **options)
 
 
 def pictures(coordinator, views) -> torch.Tensor:
@@ -65,8 +56,8 @@ def mean_error(coordinator, views, photos) -> float:
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, photos, blocks):
-    coordinator = begin(tmp_path, blocks=blocks, density=GROWING, ownership="fragments")
+def test_steps_on_the_device_make_the_photos_more_alike(begin, views, photos, blocks):
+    coordinator = begin(blocks=blocks, density=GROWING, ownership="fragments")
     seen = listen(coordinator, StepTaken)
     before = mean_error(coordinator, views, photos)
     train(coordinator, photos)
@@ -77,30 +68,24 @@ def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, 
 
 
 @pytest.mark.parametrize("light", ["exposure", "affine"])
-def test_light_is_found_on_the_device(tmp_path, begin, photos, light):
-    coordinator = begin(tmp_path, blocks=1, light=light, density=STILL)
+def test_light_is_found_on_the_device(begin, photos, light):
+    coordinator = begin(blocks=1, light=light, density=STILL)
     train(coordinator, photos)
     found = torch.stack([coordinator.run.light.of(view).detach().cpu() for view in coordinator.run.views])
     assert bool(found.isfinite().all())
     assert bool((found != found[0]).any())
 
 
-def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photos, device):
+def test_a_step_whose_gradients_are_no_numbers_is_skipped(begin, photos, device):
     """CUDA's fused Adam is told by a tensor that it is to do nothing."""
     if device.type != "cuda":
         pytest.skip("on the CPU rows are cleaned at once")
-    coordinator = begin(tmp_path, blocks=1, density=STILL)
+    coordinator = begin(blocks=1, density=STILL)
     told = listen(coordinator, Repaired)
     train(coordinator, photos, steps=2)
-    optimizer, before = coordinator.optimizers["means"], coordinator.params["means"].detach().clone()
-
-    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
-        optimizer.param_groups[0]["params"][0].grad[2] = math.nan
-
-    handle = optimizer.register_step_pre_hook(spoil)
-    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
+    before = coordinator.params["means"].detach().clone()
+    spoil_gradients(coordinator, "means", 2, math.nan, at=2)
     train(coordinator, photos, steps=1)
-    handle.remove()
     assert torch.equal(before, coordinator.params["means"])
     train(coordinator, photos, steps=1)
     assert not torch.equal(before, coordinator.params["means"])
@@ -108,11 +93,11 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photo
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode")
-def test_a_step_makes_the_host_wait_for_lists_and_numbers_alone(tmp_path, begin, photos, device, monkeypatch):
+def test_a_step_makes_the_host_wait_for_lists_and_numbers_alone(begin, photos, device, monkeypatch):
     """As tests/simulated counts it. Every other operation that synchronises raises."""
     if device.type != "cuda":
         pytest.skip("only CUDA tells what synchronises")
-    coordinator = begin(tmp_path, blocks=4, density=DensityConfig(refine_start=1.0), steps=200)
+    coordinator = begin(blocks=4, density=DensityConfig(refine_start=1.0), steps=200)
     train(coordinator, photos, steps=2)
 
     def allowed(*args, **options):
@@ -134,25 +119,25 @@ def test_a_step_makes_the_host_wait_for_lists_and_numbers_alone(tmp_path, begin,
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_a_run_that_goes_on_comes_to_the_same_picture(tmp_path, begin, views, photos, blocks):
+def test_a_run_that_goes_on_comes_to_the_same_picture(begin, views, photos, blocks):
     options = {"blocks": blocks, "density": STILL}
-    whole = begin(tmp_path / "whole", **options)
+    whole = begin("whole", **options)
     train(whole, photos)
-    stopped = begin(tmp_path / "stopped", **options)
+    stopped = begin("stopped", **options)
     train(stopped, photos, steps=STEPS // 2 + 1)
     stop(stopped)
-    went_on = begin(tmp_path / "stopped", resume=True, **options)
+    went_on = begin("stopped", resume=True, **options)
     assert went_on.state.step == STEPS // 2 + 1
     train(went_on, photos)
     off = (pictures(whole, views) - pictures(went_on, views)).abs().mean(dim=(1, 2, 3))
     assert float(off.max()) < 3e-3
 
 
-def test_memory_is_after_a_visit_what_it_was_before(tmp_path, begin, photos, device):
+def test_memory_is_after_a_visit_what_it_was_before(begin, photos, device):
     """Else a scene could not be larger than the device. Blocks are alike in size."""
     if device.type != "cuda":
         pytest.skip("only CUDA says how much memory is held")
-    coordinator = begin(tmp_path, blocks=4, steps=200, density=STILL)
+    coordinator = begin(blocks=4, steps=200, density=STILL)
     ended, held = listen(coordinator, VisitEnded), []
     while len(held) < 6:
         train_step(coordinator, photos)
@@ -179,8 +164,8 @@ def test_the_loss_is_the_cpus(device, size):
     torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)
 
 
-def test_what_is_saved_in_the_midst_of_a_visit_is_not_pinned(tmp_path, begin, photos):
-    coordinator = begin(tmp_path, blocks=1)
+def test_what_is_saved_in_the_midst_of_a_visit_is_not_pinned(begin, photos):
+    coordinator = begin(blocks=1)
     train(coordinator, photos, steps=3)
     coordinator.persist(600.0)
     tensors = coordinator.scene._unsaved[ACTIVE].tensors.values()

@@ -15,14 +15,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 
-from abcd_ns.engine.events import Event, VisitEnded
+from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.training_loop import train_step
-from tests.reference.scenes import GROWING, Photos, make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import (
+    GROWING,
+    Photos,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    steps_of,
+)
 
 STEPS = 30
 SAVE_EVERY = 4
@@ -81,19 +89,12 @@ def killer(kill: Kill) -> Callable[[str], None]:
     return reached
 
 
-def points_reached(folder: Path) -> dict[str, int]:
-    """How often an undisturbed run in `folder` reaches each point. Runs in this process."""
-    counts: dict[str, int] = {}
-
-    def count(point: str) -> None:
-        counts[point] = counts.get(point, 0) + 1
-
-    before, crash_points.reached = crash_points.reached, count
-    try:
+def points_reached(folder: Path) -> set[str]:
+    """What an undisturbed run in `folder` reaches. Runs in this process."""
+    found: set[str] = set()
+    with mock.patch.object(crash_points, "reached", found.add):
         _train(folder)
-    finally:
-        crash_points.reached = before
-    return counts
+    return found
 
 
 def _train(folder: Path, commit_seconds: float = 0.0) -> None:
@@ -101,16 +102,15 @@ def _train(folder: Path, commit_seconds: float = 0.0) -> None:
     photos = Photos(random_gaussians(60, seed=7, size=0.12), views)
     coordinator = _open(folder, views, commit_seconds)
 
-    def note(event: Event) -> None:
-        if isinstance(event, VisitEnded) and commit_seconds == 0:
-            _write(folder, coordinator.state.step)
+    def note(*_: Any) -> None:
+        (folder / _PROGRESS).write_text(str(coordinator.state.step))
 
-    coordinator.announce.subscribe(note)
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        if coordinator.state.step % SAVE_EVERY == 0:
+    if commit_seconds == 0:
+        listen(coordinator, VisitEnded, note)
+    for step in steps_of(coordinator, photos):
+        if step % SAVE_EVERY == 0:
             coordinator.save(pin="saved")
-            _write(folder, coordinator.state.step)
+            note()
     coordinator.save()
     coordinator.close()
 
@@ -138,10 +138,6 @@ def begun(folder: Path) -> bool:
     return bool(ParameterStore.open(folder / "store", read_only=True).blocks)
 
 
-def _write(folder: Path, step: int) -> None:
-    (folder / _PROGRESS).write_text(str(step))
-
-
 # -- from outside --------------------------------------------------------------------------------------
 
 
@@ -151,25 +147,15 @@ class Runs:
     body: Callable[..., None] = staticmethod(run)
     """What a process does."""
 
-    def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
-        """A process, forked: to import torch and nerfstudio in each would take seconds."""
+    def finish(self, *args: Any, within: float | None = None, **options: Any) -> int:
+        """Run to the end, until the process is killed, or for so many seconds; its exit code."""
+        # Forked: to import torch and nerfstudio in each would take seconds.
         process = multiprocessing.get_context("fork").Process(target=self.body, args=args, kwargs=options)
         process.start()
-        return process
-
-    def finish(self, *args: Any, **options: Any) -> int:
-        """Run to the end, or until the process is killed; its exit code."""
-        process = self.start(*args, **options)
-        process.join()
-        return process.exitcode
-
-    def killed_after(self, seconds: float, *args: Any, **options: Any) -> bool:
-        """Kill a run so long after its start; False if it was done by then."""
-        process = self.start(*args, **options)
-        process.join(seconds)
+        process.join(within)
         process.kill()
         process.join()
-        return process.exitcode == -signal.SIGKILL
+        return process.exitcode
 
 
 def lost_steps(folder: Path) -> int:

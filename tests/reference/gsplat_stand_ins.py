@@ -52,8 +52,7 @@ class Differentiable(torch.autograd.Function):
             with torch.enable_grad():
                 results = [x for x in ctx.compute(*leaves) if x.is_floating_point()]
             asked = [x for x in leaves if x.requires_grad]
-            if not any(x.requires_grad for x in results):  # as colours of degree 0 by directions
-                return [torch.zeros_like(x) for x in asked]
+
             return torch.autograd.grad(results, asked, tensors[len(leaves) :], materialize_grads=True)
 
         found = iter(kernel(gradient, *inputs, *given))
@@ -168,8 +167,7 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
         return (torch.where(masks[0][..., None], colors, torch.nan) if masks else colors,)
 
     tensors = (dirs, coeffs) if masks is None else (dirs, coeffs, masks)
-    tensors = (tensor.contiguous() for tensor in tensors)
-    return Differentiable.apply(_harmonics, *tensors)[0]
+    return Differentiable.apply(_harmonics, *(tensor.contiguous() for tensor in tensors))[0]
 
 
 @stands_in(packed=True)

@@ -108,32 +108,22 @@ def _project_surfel(g: Gaussians, i: int, mean_c: Tensor, view: View) -> tuple:
     return middle, sigma, opacity, math.ceil(3 * math.sqrt(max(1e-4, extent)))
 
 
-def _in_image(middle: Tensor, radius: int, view: View) -> bool:
-    size = (view.width, view.height)
-    return all(-radius < x < side + radius for x, side in zip(middle.tolist(), size, strict=True))
-
-
 def _splats(
     g: Gaussians, view: View, sh_degree: int, antialiased: bool, windowed: bool, surfels: bool
 ) -> tuple[Tensor, list[_Splat]]:
     R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
     center = -R.T @ t
     means_c = [R @ g.means[i] + t for i in range(len(g))]
-    projected = [
-        (view.K @ (m if m[2] > 0.01 else torch.ones_like(m)))[:2] / (m[2] if m[2] > 0.01 else 1)
-        for m in means_c
-    ]
-    means2d = torch.stack(projected) if projected else g.means.new_zeros((0, 2))
+    means2d = torch.stack([(view.K @ mean)[:2] / mean[2] for mean in means_c])
     splats = []
     for i in range(len(g)):
-        if not 0.01 <= means_c[i][2].item() <= 1e10:
-            splats.append(None)
-            continue
         found = _project(g, i, means2d[i], means_c[i], view, antialiased)
         if surfels:
             found = _project_surfel(g, i, means_c[i], view)
         middle, sigma, opacity, radius = found
-        radius = radius if _in_image(middle, radius, view) else 0
+        (x, y), (width, height) = middle.tolist(), (view.width, view.height)
+        if not (-radius < x < width + radius and -radius < y < height + radius):
+            radius = 0
         color = sh_color(g.features_dc[i], g.features_rest[i], g.means[i] - center, sh_degree)
         splats.append(_Splat(middle, sigma, opacity, color, means_c[i][2], radius, windowed))
     return means2d, splats
@@ -141,11 +131,10 @@ def _splats(
 
 def _touches_tile(splat: _Splat, px: int, py: int) -> bool:
     """Whether the square of the radius touches the 16 px tile that holds the pixel."""
-    for center, pixel in zip(splat.mean.tolist(), (px, py), strict=True):
-        tile = pixel // 16
-        if not math.floor((center - splat.radius) / 16) <= tile < math.ceil((center + splat.radius) / 16):
-            return False
-    return True
+    return all(
+        math.floor((center - splat.radius) / 16) <= pixel // 16 < math.ceil((center + splat.radius) / 16)
+        for center, pixel in zip(splat.mean.tolist(), (px, py), strict=True)
+    )
 
 
 def _pixel(splats: list[_Splat], px: int, py: int, near: float, far: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -178,7 +167,8 @@ def naive_rasterize(
     antialiased: bool = False,
     primitive: str = "3dgs",
 ) -> NaiveRaster:
-    """Draw in float64. `near` and `far` [h, w] are the z window, of the frozen if any, else of all."""
+    """Draw what is before the camera in float64. `near` and `far` [h, w] are the z window, of the frozen if
+    any, else of all."""
     crop = crop or view.full
     options = (sh_degree, antialiased)
     own_window, surfels = near is not None and frozen is None, primitive == "2dgs"
@@ -186,7 +176,7 @@ def naive_rasterize(
     everyone = list(own)
     if frozen is not None:
         everyone += _splats(frozen.detach(), view, *options, near is not None, surfels)[1]
-    drawable = [s for s in everyone if s is not None and s.radius > 0]
+    drawable = [s for s in everyone if s.radius > 0]
     drawable.sort(key=lambda s: s.depth.item())  # stable: ties by index
     pixels = []
     for row in range(crop.height):
@@ -196,5 +186,5 @@ def naive_rasterize(
             )
             pixels.append(_pixel(drawable, crop.x + col, crop.y + row, low, high))
     color, T, depth = (torch.stack([p[k] for p in pixels]) for k in range(3))
-    size, radii = (crop.height, crop.width), [0 if s is None else s.radius for s in own]
+    size, radii = (crop.height, crop.width), [s.radius for s in own]
     return NaiveRaster(color.view(*size, 3), T.view(size), depth.view(size), means2d, radii)

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render import Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.z_window import TileGrid
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
 
 
 def random_gaussians(
@@ -101,8 +101,12 @@ def assert_drawn_alike(
         assert relative_error(found[name], wanted[name]) < gradient, name
 
 
+def assert_same_layer(found: Layer, expected: Layer, atol: float = 0.0) -> None:
+    """To the last bit unless told otherwise."""
+    for name in ("color", "transmittance"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0.0, atol=atol)
+
+
 def relative_error(value: Tensor, reference: Tensor) -> float:
     """The largest difference, as a share of the largest reference value."""
-    if reference.numel() == 0:
-        return 0.0
     return float((value - reference).abs().max() / reference.abs().max().clamp_min(1e-30))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import UnionType
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.initialize import PointCloud, split_off
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, attach, nothing_active
+from abcd_ns.engine.layers.layer_renderer import LayerRenderer
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -30,7 +31,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import look_at
 
@@ -84,6 +85,15 @@ class WatchedScene(MemoryScene):
     def drawn(self, block: int, *given: Any) -> Gaussians:
         self.read.append(block)
         return super().drawn(block, *given)
+
+
+def renderer_of(
+    scene: Gaussians | MemoryScene, draw: Rasterizer, blocks: int = 4, **options
+) -> LayerRenderer:
+    """Of a scene, or of Gaussians cut into blocks; by fragments and block by block unless told otherwise."""
+    if isinstance(scene, Gaussians):
+        scene = MemoryScene(build_kd(scene.means, blocks), scene)
+    return LayerRenderer(scene, draw, **{"ownership": "fragments", "pass_gaussians": 0, **options})
 
 
 class Photos:
@@ -191,11 +201,32 @@ def assert_same_state(one: BlockState, other: BlockState) -> None:
     assert one.clocks == other.clocks
 
 
-def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:
-    """A list of the events of this kind, which grows as they happen."""
+def listen(trainer: Trainer, kind: type | UnionType, note: Callable = lambda event: event) -> list[Any]:
+    """A list of the events of this kind, or of what `note` makes of each, which grows as they happen."""
     heard: list[Any] = []
-    trainer.announce.subscribe(lambda event: heard.append(event) if isinstance(event, kind) else None)
+    trainer.announce.subscribe(lambda event: heard.append(note(event)) if isinstance(event, kind) else None)
     return heard
+
+
+def steps_of(trainer: Trainer, photos: Callable) -> Iterator[int]:
+    """Train until the budget is used up; the steps so far, after each."""
+    while not trainer.finished:
+        train_step(trainer, photos)
+        yield trainer.state.step
+
+
+def spoil_gradients(trainer: Trainer, name: str, row: int, value: float, at: int | None = None) -> None:
+    """The row's gradient of one parameter is `value` in every step, or after `at` of them: a hook that runs
+    before all others."""
+    optimizer = trainer.optimizers[name]
+
+    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
+        gradient = optimizer.param_groups[0]["params"][0].grad
+        if gradient is not None and len(gradient) > row and at in (None, trainer.state.step):
+            gradient[row] = value
+
+    handle = optimizer.register_step_pre_hook(spoil)
+    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
 
 
 def stop(trainer: Trainer) -> None:

@@ -19,16 +19,16 @@ experimental.
 
 import functools
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
-
-from tests.reference.device_counts import Counts
 
 # Autograd starts threads for all devices that there are at a process' first backward pass, and after that no
 # process may be forked from it. Here, before there is a device, it starts none.
@@ -79,6 +79,51 @@ INDEXING = {"_index_put_impl_", "_unsafe_index", "index", "index_put", "index_pu
 TAKES_CPU_SCALARS = {*INDEXING, "fill_", "fill", "masked_fill", "masked_fill_"}
 """Operations, beside the pointwise ones, whose operands may be 0-dimensional CPU tensors. A fused Adam is
 none: its kernel reads `step` by address."""
+
+
+@dataclass
+class Counts:
+    """What happened on the device."""
+
+    copies_to_host: int = 0
+    """Of tensors; values that are read one by one are waits alone."""
+    bytes_to_host: int = 0
+    copies_to_device: int = 0
+    bytes_to_device: int = 0
+    live_bytes: int = 0
+    """Of all tensors that are there now."""
+    peak_bytes: int = 0
+    """The most that were there at once."""
+    waits: Counter[str] = field(default_factory=Counter)
+    """Points where the host waits for all that it has launched, by operation. Copies from and to pageable
+    memory are among them, unless they go to the device and are called with `non_blocking`."""
+
+    @property
+    def waited(self) -> int:
+        return self.waits.total()
+
+    def copy(self) -> "Counts":
+        return self.since(Counts())
+
+    def since(self, earlier: "Counts") -> "Counts":
+        """What came after `earlier`; of the bytes that are there, this moment's."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        counted = values.keys() - {"live_bytes", "peak_bytes"}
+        less = {name: values[name] - getattr(earlier, name) for name in counted}
+        return Counts(**{**values, **less})
+
+    def reset_peak(self) -> None:
+        self.peak_bytes = self.live_bytes
+
+    def wait(self, why: str) -> None:
+        self.waits[why] += 1
+
+    def move(self, tensor: Tensor, *, to_device: bool, blocks: bool = True) -> None:
+        way = "to_device" if to_device else "to_host"
+        setattr(self, f"copies_{way}", getattr(self, f"copies_{way}") + 1)
+        setattr(self, f"bytes_{way}", getattr(self, f"bytes_{way}") + tensor.numel() * tensor.element_size())
+        if blocks:
+            self.wait(f"copy {way}".replace("_", " "))
 
 
 _counts = Counts()

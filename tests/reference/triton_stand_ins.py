@@ -63,24 +63,16 @@ def skips(count: Tensor, norms: Sequence[Tensor]) -> Tensor:
 
 
 def windowed(
-    near: Tensor,
-    far: Tensor,
-    isect_ids: Tensor,
-    flatten_ids: Tensor,
-    always: int,
-    bits: int,
-    tiles: int,
-    last_key: int,
+    near, far, isect_ids, flatten_ids, always: int, bits: int, tiles: int, last_key: int
 ) -> tuple[Tensor, Tensor]:
     """Keys and owners: those that are kept, and as many others as there were."""
     place, z = isect_ids >> 32, (isect_ids & 0xFFFFFFFF).int().view(torch.float32)
     tile = (place >> bits) * tiles + place % (1 << bits)
     keep = (z >= near[tile]) & (z < far[tile]) | (flatten_ids < always)
-    others = int((~keep).sum())
-    return (
-        torch.cat((isect_ids[keep], isect_ids.new_full((others,), last_key))),
-        torch.cat((flatten_ids[keep], flatten_ids.new_zeros(others))),
-    )
+    keys, owners = torch.full_like(isect_ids, last_key), torch.zeros_like(flatten_ids)
+    count = int(keep.sum())
+    keys[:count], owners[:count] = isect_ids[keep], flatten_ids[keep]
+    return keys, owners
 
 
 TWINS = photometric, shade, skips, windowed, between

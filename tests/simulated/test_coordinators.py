@@ -63,12 +63,12 @@ def test_what_is_hardly_missed_goes_at_the_end(on_device, photos, target, monkey
     coordinator = on_device(**options, density=DensityConfig())
     told, held = listen(coordinator, PrunedAtEnd), []
 
-    class Watched(HeldScene):
-        def __init__(self, *given) -> None:
-            super().__init__(*given)
-            held.append(weakref.ref(self))
+    def watched(*given) -> HeldScene:
+        scene = HeldScene(*given)
+        held.append(weakref.ref(scene))
+        return scene
 
-    monkeypatch.setattr("abcd_ns.engine.train.step.final_pruning.HeldScene", Watched)
+    monkeypatch.setattr("abcd_ns.engine.train.step.final_pruning.HeldScene", watched)
     gc.disable()
     try:
         train(coordinator, photos)

@@ -1,7 +1,6 @@
 """What a step on a device waits for and copies, and what it tells a step late."""
 
 import math
-from unittest import mock
 
 import pytest
 import torch
@@ -16,46 +15,31 @@ from abcd_ns.engine.train.density.pruning import BLEND_SUMS
 from abcd_ns.engine.train.health import LATE_AFTER, widest
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop
-from tests.reference.device_counts import Counts
 from tests.reference.rasterizer_scenes import as_leaves
-from tests.reference.scenes import STILL, listen, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    STILL,
+    listen,
+    random_gaussians,
+    ring_of_views,
+    spoil_gradients,
+    whole_scene,
+)
 from tests.reference.simulated_device import DEVICE
 
 GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0)
 
 
-def steps_alone(coordinator, photos, counts: Counts) -> list[Counts]:
-    """What is counted in each step, but for visits' beginnings and ends."""
-    found, edges = [], []
-
-    def noting(method):
-        def noted(*args):
-            before = counts.copy()
-            result = method(*args)
-            edges.append(counts.since(before))
-            return result
-
-        return noted
-
-    noted = {name: noting(getattr(coordinator, name)) for name in ("begin_visit", "end_visit")}
-    with mock.patch.multiple(coordinator, **noted):
-        while not coordinator.finished:
-            edges.clear()
-            before = counts.copy()
-            train_step(coordinator, photos)
-            taken = counts.since(before)
-            for edge in edges:
-                taken = taken.since(edge)
-            found.append(taken)
-    return found
-
-
 @pytest.mark.parametrize("parts", [0, 300])
 def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
-    coordinator = on_device(blocks=4, steps=12, density=GATHERING, crop_pixels=parts)
-    _, *later = steps_alone(coordinator, photos, simulated_gsplat)  # the first uploads cameras, too
-    for taken in later:
+    coordinator, counted = on_device(blocks=4, steps=24, density=GATHERING, crop_pixels=parts), []
+    while not coordinator.finished:
+        active, before = coordinator.state.active, simulated_gsplat.copy()
+        train_step(coordinator, photos)
+        if active is not None and coordinator.state.active is active:  # no visit began or ended
+            counted.append(simulated_gsplat.since(before))
+    assert len(counted) > 8
+    for taken in counted:
         apart = taken.waits.pop("isect_tiles")
         assert apart == 1
         assert dict(+taken.waits) in ({}, {"event": 1})
@@ -119,44 +103,31 @@ def test_listeners_hear_of_a_step_when_the_next_is_taken(make, on_device, photos
             assert event.psnr == pytest.approx(now[k - 1].psnr, abs=1e-3)
 
 
-def spoil_once(coordinator, step: int) -> None:
-    """One row's gradient is no number in one step."""
-
-    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
-        if coordinator.state.step == step:
-            optimizer.param_groups[0]["params"][0].grad[2] = math.nan
-
-    optimizer = coordinator.optimizers["means"]
-    handle = optimizer.register_step_pre_hook(spoil)
-    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
-
-
 def values(coordinator) -> dict[str, torch.Tensor]:
-    return {name: coordinator.params[name].detach().clone() for name in PARAM_NAMES}
+    return {name: coordinator.params[name].detach().cpu() for name in PARAM_NAMES}
 
 
 def test_a_step_whose_gradients_are_no_numbers_is_skipped(on_device, photos):
     coordinator = on_device(blocks=1, steps=12, density=GATHERING)
     told = listen(coordinator, Repaired)
-    spoil_once(coordinator, 3)
-    spoil_once(coordinator, 6)
+    for step in (3, 6):
+        spoil_gradients(coordinator, "means", 2, math.nan, at=step)
     train(coordinator, photos, steps=3)
     before = values(coordinator)
     adam = coordinator.optimizers["means"].state[coordinator.params["means"]]
     clock = float(adam["step"])
     train_step(coordinator, photos)
-    assert all(torch.equal(before[name].cpu(), value.cpu()) for name, value in values(coordinator).items())
+    assert all(torch.equal(before[name], value) for name, value in values(coordinator).items())
     assert float(adam["step"]) == clock
     assert told == []  # nobody knows yet
     train_step(coordinator, photos)
-    assert not torch.equal(before["means"].cpu(), coordinator.params["means"].detach().cpu())
+    assert not torch.equal(before["means"], values(coordinator)["means"])
     assert [(event.what, event.count) for event in told] == [("gradients", 1)]
     # From then on one row is cleaned, and the others are trained.
     train_step(coordinator, photos)
     before = values(coordinator)
     train_step(coordinator, photos)
-    moved = (before["means"] != coordinator.params["means"].detach()).any(dim=1).cpu()
-    assert bool(moved.any())
+    assert not torch.equal(before["means"], values(coordinator)["means"])
     assert [(event.what, event.count) for event in told] == [("gradients", 1)] * 2
     train(coordinator, photos, steps=4)
     assert bool(coordinator.visit.block.growth["worth"].isfinite().all())
@@ -168,7 +139,7 @@ def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(on_device,
     """Rows are looked at one by one for a while, and steps that six optimizers count once are counted on."""
     options = {"density": GATHERING, "commit_seconds": 3600.0}  # a commit waits, too
     coordinator = on_device(blocks=1, steps=LATE_AFTER + 12, **options)
-    spoil_once(coordinator, 3)
+    spoil_gradients(coordinator, "means", 2, math.nan, at=3)
     waits = []
     for _ in range(LATE_AFTER + 10):
         before = simulated_gsplat.copy()

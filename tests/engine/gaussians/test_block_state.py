@@ -10,7 +10,7 @@ from abcd_ns.engine.gaussians.block_state import DEGREES, DRAWN, BlockState, Clo
 from abcd_ns.engine.gaussians.param_swap import active_gaussians, attach, detach, nothing_active
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.scenes import assert_same_state, equal, random_gaussians
+from tests.reference.scenes import activated, assert_same_state, equal, random_gaussians
 
 COEFFICIENTS = (0, 3, 8, 15)
 """Of degrees 1 and up, by the highest degree."""
@@ -25,12 +25,6 @@ def some_state(count: int, seed: int = 0) -> BlockState:
         {"worth": torch.rand(count, generator=generator), "count": torch.rand(count, generator=generator)},
         Clocks(steps=7, adam_views=5, visits=2),
     )
-
-
-def active(state: BlockState):
-    params, optimizers = nothing_active(1)
-    attach(state, params, optimizers)
-    return params, optimizers
 
 
 def take_step(params, optimizers) -> None:
@@ -58,7 +52,7 @@ def test_tensors_of_unequal_length_are_refused():
 
 
 def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():
-    params, optimizers = active(some_state(6))
+    params, optimizers = activated(random_gaussians(6))
     kept = copy.copy(params)
     take_step(params, optimizers)
     attach(some_state(3, seed=5), params, optimizers)
@@ -67,8 +61,8 @@ def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():
 
 
 def test_detached_tensors_do_not_follow_later_steps():
-    state = some_state(6)
-    params, optimizers = active(state)
+    state, (params, optimizers) = some_state(6), nothing_active(1)
+    attach(state, params, optimizers)
     stored = detach(params, optimizers, state.growth, state.clocks)
     take_step(params, optimizers)
     assert_same_state(stored, state)

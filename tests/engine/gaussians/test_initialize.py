@@ -30,13 +30,9 @@ def rows(gaussians: PointCloud) -> set[tuple[float, ...]]:
     return {tuple(row) for row in gaussians.means.tolist()}
 
 
-@pytest.mark.parametrize("limit", [400, 1000])
-def test_within_the_limit_all_begin_as_they_are(many, limit):
-    assert split_off(many, limit, seed=0)[0] is many
-
-
 @pytest.mark.parametrize("limit", [1, 50, 399])
 def test_of_too_many_a_choice_begins(many, limit):
+    assert split_off(many, len(many), seed=0)[0] is many
     few, others = split_off(many, limit, seed=0)
     assert len(few) == limit
     assert rows(few) | rows(others) == rows(many)
@@ -58,11 +54,10 @@ def test_fewer_gaussians_are_wider_so_that_no_gaps_are_left(many):
     ("points", "warns"),
     [
         (torch.zeros(0, 3), True),
-        (torch.zeros(1, 3), True),
         (torch.eye(3), True),
         (torch.zeros(5, 3), True),
-        (torch.cat([torch.eye(3), torch.zeros(1, 3)]), False),
-        (torch.linspace(0, 1, 5)[:, None] * torch.ones(1, 3), False),
+        (torch.eye(4, 3), False),
+        (torch.linspace(0, 1, 5)[:, None].expand(5, 3), False),
     ],
 )
 def test_too_few_points_are_warned_of_and_give_numbers_all_the_same(points, warns):
@@ -106,13 +101,6 @@ def test_a_pixel_is_as_wide_as_the_nearest_view_that_sees_the_point_has_it():
     assert found[2].isinf()
 
 
-def test_points_that_nobody_sees_stay_and_so_do_all_at_0():
-    points, colors = random_points(40, 1e-4, seed=4)
-    unseen = points + torch.tensor([0.0, 0.0, 500.0])
-    assert len(thin_points(unseen, colors, VIEWS, 2.0)[0]) == 40
-    assert thin_points(points, colors, VIEWS, 0.0)[0] is points
-
-
 def by_cube(points, colors, pixels: float) -> dict[tuple, list[torch.Tensor]]:
     """Rows of place and colour by cube, one point after the other; unseen points have cubes of their own."""
     cubes: dict[tuple, list[torch.Tensor]] = {}
@@ -128,6 +116,7 @@ def test_points_of_a_cube_become_their_mean_cubes_in_order(monkeypatch, chunk):
     monkeypatch.setattr("abcd_ns.engine.gaussians.initialize.CHUNK", chunk)
     points, colors = random_points(200, 0.3, seed=6)
     points[::11] += 400.0  # unseen
+    assert thin_points(points, colors, VIEWS, 0.0)[0] is points
     cubes = by_cube(points, colors, 3.0)
     found = torch.cat(thin_points(points, colors, VIEWS, 3.0), dim=1)
     assert 60 < len(found) == len(cubes) < 190

@@ -1,6 +1,5 @@
 """Learning rates of steps of several views."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -16,14 +15,15 @@ from tests.reference.scenes import activated, random_gaussians
 
 def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
-    params, adam = activated(random_gaussians(1))
-    pace, before = Pace(adam, fast_start=False), {name: params[name].detach().clone() for name in PARAM_NAMES}
+    before = random_gaussians(1)
+    params, adam = activated(before)
+    pace = Pace(adam, fast_start=False)
     for _ in range(steps):
         pace.set(views, 0, means_decay=1.0)
         for name in PARAM_NAMES:
             params[name].grad = torch.ones_like(params[name])
             adam[name].step()
-    return {name: float((params[name].detach() - before[name]).abs().max()) for name in PARAM_NAMES}
+    return {name: float((params[name].detach() - value).abs().max()) for name, value in before.items()}
 
 
 @given(views=st.integers(1, 16))
@@ -34,7 +34,7 @@ def test_views_that_agree_come_as_far_together_as_one_by_one(views):
 
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
-    ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 2, 4), (2_000, 4, 4), (10_000, 1, 1)]
+    ("views", "batch", "times"), [(0, 2, 4), (2_500, 1, 2), (2_000, 4, 4), (10_000, 1, 1)]
 )
 def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times, late):
     """And harmonics that come late larger ones still."""
@@ -44,33 +44,6 @@ def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times, l
     shares = {"means": 0.5, "features_rest": LATE_RATE if late else 1.0}
     expected = {name: times * rate * shares.get(name, 1.0) for name, rate in given.items()}
     assert {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES} == pytest.approx(expected)
-
-
-def corrected_moments(adam, parameter) -> tuple[float, float]:
-    """Adam's estimates of the gradient and its square, bias-corrected as torch's Adam does."""
-    state, (first, second) = adam.state[parameter], adam.param_groups[0]["betas"]
-    step, moments = float(state["step"]), [float(state[name].mean()) for name in MOMENTS]
-    return moments[0] / (1 - first**step), moments[1] / (1 - second**step)
-
-
-def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
-    """Adam's estimates after each of some steps, for a gradient that is always 1.
-
-    Args:
-        batches: (views in a step, steps); the block is taken out and put back in between.
-    """
-    params, adam = nothing_active(sh_degree=0)
-    pace, stored = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
-    for batch, steps in batches:
-        attach(stored, params, adam, batch=batch)
-        clocks = stored.clocks
-        for _ in range(steps):
-            pace.set(batch, 0, means_decay=1.0)
-            params["scales"].grad = torch.ones_like(params["scales"])
-            adam["scales"].step()
-            clocks = replace(clocks, adam_views=clocks.adam_views + batch)
-            yield corrected_moments(adam["scales"], params["scales"])
-        stored = detach(params, adam, {}, clocks)
 
 
 @pytest.mark.parametrize(
@@ -83,9 +56,26 @@ def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
     ],
 )
 def test_moments_are_read_with_the_decay_that_they_had(batches, rel):
-    """A gradient of 1 is found to be 1 at every step, whatever the views of the steps before."""
-    for moments in stepped_in(batches):
-        assert moments == pytest.approx((1, 1), rel=rel)
+    """A gradient of 1 is found to be 1 at every step, whatever the views of the steps before.
+
+    Args:
+        batches: (views in a step, steps); the block is taken out and put back in between.
+    """
+    params, optimizers = nothing_active(sh_degree=0)
+    pace, stored = Pace(optimizers, fast_start=False), BlockState.fresh(random_gaussians(2))
+    for batch, steps in batches:
+        attach(stored, params, optimizers, batch=batch)
+        parameter, adam, clocks = params["scales"], optimizers["scales"], stored.clocks
+        for _ in range(steps):
+            pace.set(batch, 0, means_decay=1.0)
+            parameter.grad = torch.ones_like(parameter)
+            adam.step()
+            clocks = replace(clocks, adam_views=clocks.adam_views + batch)
+            state = adam.state[parameter]
+            for name, beta in zip(MOMENTS, adam.param_groups[0]["betas"], strict=True):
+                corrected = float(state[name].mean()) / (1 - beta ** float(state["step"]))
+                assert corrected == pytest.approx(1, rel=rel)
+        stored = detach(params, optimizers, {}, clocks)
 
 
 @given(begun=st.integers(0, 4000), batch=st.integers(1, 9), taken=st.integers(0, 500))

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.types import Layer
 from tests.engine.space.test_tree import SEEDS
+from tests.reference.rasterizer_scenes import assert_same_layer
 
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
 DTYPES = st.sampled_from(list(TOLERANCE))
@@ -19,12 +20,6 @@ def random_layers(seed: int, n: int, dtype: torch.dtype) -> list[Layer]:
         return torch.rand(*shape, generator=generator, dtype=dtype)
 
     return [Layer(draw(3, 4, 3) / 2, draw(3, 4)) for _ in range(n)]
-
-
-def assert_close(layer: Layer, expected: Layer) -> None:
-    tolerance = {"rtol": 0.0, "atol": TOLERANCE[layer.color.dtype]}
-    torch.testing.assert_close(layer.color, expected.color, **tolerance)
-    torch.testing.assert_close(layer.transmittance, expected.transmittance, **tolerance)
 
 
 def by_hand(layers: list[Layer]) -> Layer:
@@ -40,7 +35,7 @@ def by_hand(layers: list[Layer]) -> Layer:
 @given(SEEDS, st.integers(1, 7), DTYPES)
 def test_fold_is_the_sum_over_layers(seed, n, dtype):
     layers = random_layers(seed, n, dtype)
-    assert_close(fold(layers), by_hand(layers))
+    assert_same_layer(fold(layers), by_hand(layers), TOLERANCE[dtype])
 
 
 @given(SEEDS, DTYPES, st.booleans())

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_renderer import RenderSettings
 from abcd_ns.engine.layers.surface import NEARER, colored_by_normal, fog_in_white, median_depth, normals_in
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -13,7 +13,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
 from abcd_ns.engine.types import View
 from tests.reference.naive_rasterizer import rotation
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import random_gaussians, renderer_of, ring_of_views
 
 SCENE = random_gaussians(60, size=0.2, dtype=torch.float64)
 VIEWS = ring_of_views(3, dtype=torch.float64)
@@ -21,21 +21,10 @@ SETTINGS = RenderSettings(sh_degree=0)
 PRIMITIVES = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 
 
-def renderer_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gaussians) -> LayerRenderer:
-    scene = ChangedScene(MemoryScene(build_kd(SCENE.means, 4), SCENE), lambda _, found: keep(found))
-    rasterizer = TorchRasterizer(primitive=primitive)
-    options = {"ownership": "fragments", "pass_gaussians": pass_gaussians}
-    return LayerRenderer(scene, rasterizer, **options)
-
-
 def fragments_at(alone: list[Raster], x: int, y: int) -> list[tuple[float, int, float]]:
     """(depth, which Gaussian, alpha) of a pixel's fragments, front to back, by pictures of each alone."""
-    found = []
-    for k, one in enumerate(alone):
-        alpha = 1 - float(one.transmittance[y, x])
-        if alpha > 0:
-            found.append((float(one.depth[y, x]) / alpha, k, alpha))
-    return sorted(found)
+    alphas = [1 - float(one.transmittance[y, x]) for one in alone]
+    return sorted((float(alone[k].depth[y, x]) / alpha, k, alpha) for k, alpha in enumerate(alphas) if alpha)
 
 
 def facing(k: int, view: View, primitive: str) -> torch.Tensor:
@@ -46,11 +35,11 @@ def facing(k: int, view: View, primitive: str) -> torch.Tensor:
 
 def drawn(primitive: str, view: View, pass_gaussians: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The median depth and the normals of a picture."""
-    depth = median_depth(renderer_of(primitive, pass_gaussians), view, SETTINGS)
-    is_flat = primitive == "2dgs"
-    renderer = renderer_of(primitive, pass_gaussians, lambda g: colored_by_normal(g, view, is_flat))
-    assert (len(renderer.nodes()) == 4) == (pass_gaussians == 0)
-    return depth, normals_in(renderer.picture(view, SETTINGS))
+    draw, scene = TorchRasterizer(primitive=primitive), MemoryScene(build_kd(SCENE.means, 4), SCENE)
+    colored = ChangedScene(scene, lambda _, found: colored_by_normal(found, view, primitive == "2dgs"))
+    renderers = [renderer_of(each, draw, pass_gaussians=pass_gaussians) for each in (scene, colored)]
+    assert (len(renderers[0].nodes()) == 4) == (pass_gaussians == 0)
+    return median_depth(renderers[0], view, SETTINGS), normals_in(renderers[1].picture(view, SETTINGS))
 
 
 @PRIMITIVES

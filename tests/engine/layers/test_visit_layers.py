@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers.footprints import footprints
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_renderer import RenderSettings
 from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from tests.reference.scenes import WatchedScene, random_gaussians, ring_of_views
+from tests.reference.scenes import WatchedScene, random_gaussians, renderer_of, ring_of_views
 
 BLOCK = 5
 
@@ -22,10 +22,9 @@ def visit_layers(
     """Of a visit to one of 16 blocks, and the blocks that it has read so far."""
     gaussians, draw, views = random_gaussians(200, size=0.03), TorchRasterizer(), ring_of_views(6)
     scene = WatchedScene(build_kd(gaussians.means, 16), gaussians)
-    renderer = LayerRenderer(scene, draw, ownership="fragments", pass_gaussians=0)
     own = scene.gaussians(BLOCK)
     layers = VisitLayers(
-        renderer,
+        renderer_of(scene, draw),
         LayerStore(torch.device("cpu"), device_bytes),
         footprints(own, BLOCK, views, draw),
         own,

@@ -5,22 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
+from abcd_ns.engine.layers.layer_renderer import RenderSettings
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.capture.poses import by_step, turned
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import random_gaussians, renderer_of, ring_of_views
 
 SCENE = random_gaussians(60, size=0.15, dtype=torch.float64)
 VIEWS = ring_of_views(3, dtype=torch.float64)
-
-
-def whole_pictures_of(pass_gaussians: int, *layers_bytes: int) -> WholePictures:
-    scene = MemoryScene(build_kd(SCENE.means, 4), SCENE)
-    renderer = LayerRenderer(scene, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians)
-    return WholePictures(renderer, RenderSettings(sh_degree=1), *layers_bytes)
 
 
 def weights_for(view):
@@ -31,7 +23,9 @@ def weights_for(view):
 @pytest.mark.parametrize("pass_gaussians", [0, 1000])
 def test_pictures_and_gradients_of_poses_are_those_of_the_merged_picture(pass_gaussians):
     """By differences of the picture that is drawn at once, for each way in which a camera may move."""
-    draw, seen, pictures = TorchRasterizer(), [], whole_pictures_of(pass_gaussians)
+    draw, seen = TorchRasterizer(), []
+    renderer = renderer_of(SCENE, draw, pass_gaussians=pass_gaussians)
+    pictures = WholePictures(renderer, RenderSettings(sh_degree=1))
 
     def assert_merged(view, picture):
         merged = draw(SCENE, replace(view, viewmat=view.viewmat.detach()), sh_degree=1)

@@ -20,6 +20,7 @@ from abcd_ns.engine.types import Crop
 from abcd_ns.machine import threads_wanted
 from tests.reference.rasterizer_scenes import (
     assert_drawn_alike,
+    assert_same_layer,
     drawn,
     gradients,
     random_gaussians,
@@ -81,8 +82,7 @@ def test_windows_cuts_and_median_depths_are_those_of_torch(primitive):
     one, other = (next(draw.cuts(SCENE, [shot], sh_degree=2)) for draw in (fast, slow))
     picture, _ = TOLERANCES[primitive]
     for found, expected in ((one.front, other.front), (one.back, other.back)):
-        assert relative_error(found.color, expected.color) < picture
-        assert relative_error(found.transmittance, expected.transmittance) < picture
+        assert_same_layer(found, expected, atol=picture * float(expected.color.abs().max()))
     # Lists of torch hold what fast ones leave out for leaving no fragment.
     assert set(one.kept_ids.tolist()) <= set(other.kept_ids.tolist())
     assert torch.equal(one.inside.planes, fast.project(SCENE, VIEW, sh_degree=2)[one.kept_ids].planes)
@@ -152,10 +152,7 @@ def damaged(folder: Path) -> None:
 FAULTS = {
     "compiler fails": (lambda patch, _: failing(patch), "no such instruction"),
     "compiler is killed": (lambda patch, _: failing(patch, -9, ""), "died with"),
-    "no compiler": (
-        lambda patch, _: patch.setattr(native, "find_compiler", lambda: None),
-        "apt-get install g",
-    ),
+    "no compiler": (lambda patch, _: patch.setattr(native, "find_compiler", lambda: None), "apt-get install"),
     "folder is a file": (lambda _, folder: folder.write_text(""), "kernels"),
     "damaged library": (lambda _, folder: damaged(folder), "native-"),
 }

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
@@ -23,9 +24,7 @@ from tests.reference.scenes import random_gaussians, ring_of_views
 SH_0 = 0.28209479177387814
 
 
-@pytest.fixture
-def rasterizer():
-    return TorchRasterizer(use_native=False)
+DRAW = TorchRasterizer(use_native=False)
 
 
 def painted(gaussians, chosen):
@@ -34,48 +33,43 @@ def painted(gaussians, chosen):
     return replace(gaussians, features_dc=shade[:, None].expand(-1, 3).contiguous())
 
 
-def test_influence_is_what_a_block_painted_white_adds_to_a_black_picture(rasterizer):
+def test_influence_is_what_a_block_painted_white_adds_to_a_black_picture():
     gaussians, views = random_gaussians(80, seed=4, size=0.15), ring_of_views(3)
     owner = torch.arange(80) % 3
-    found = influence(gaussians, owner, views, rasterizer)
+    found = influence(gaussians, owner, views, DRAW)
     for block in range(3):
         for view in views:
             small = coarser(view, 2)
-            picture = rasterizer(painted(gaussians, owner == block), small, sh_degree=0)
+            picture = DRAW(painted(gaussians, owner == block), small, sh_degree=0)
             assert found[block][view.index] == pytest.approx(float(picture.color[..., 0].mean()), abs=2e-6)
 
 
 def test_large_views_are_looked_at_in_small_pictures():
-    sizes = []
-
-    class Watching(TorchRasterizer):
-        def draw(self, gaussians, shots, **options):
-            sizes.extend((shot.crop.width, shot.crop.height) for shot in shots)
-            return super().draw(gaussians, shots, **options)
-
     views, gaussians = ring_of_views(2, width=800, height=600), random_gaussians(20, size=0.2)
-    found = influence(gaussians, torch.zeros(20, dtype=torch.int64), views, Watching(use_native=False))
-    assert set(sizes) == {(80, 60)}
-    full = weights(gaussians, TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)])
+    with mock.patch.object(DRAW, "draw", wraps=DRAW.draw) as draw:
+        found = influence(gaussians, torch.zeros(20, dtype=torch.int64), views, DRAW)
+    shots = (shot for call in draw.call_args_list for shot in call.args[1])
+    assert {(shot.crop.width, shot.crop.height) for shot in shots} == {(80, 60)}
+    full = weights(gaussians, DRAW, [Shot(views[0], views[0].full)])
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
 
 
-def test_what_stands_in_front_takes_its_share(rasterizer):
+def test_what_stands_in_front_takes_its_share():
     gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
     shot = Shot(view, view.full)
-    (bare,) = weights(gaussians, rasterizer, [shot])
-    whole = share_shown(gaussians, rasterizer, shot, None)
-    half = share_shown(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
+    (bare,) = weights(gaussians, DRAW, [shot])
+    whole = share_shown(gaussians, DRAW, shot, None)
+    half = share_shown(gaussians, DRAW, shot, torch.full((view.height, view.width), 0.5))
     assert whole == pytest.approx(float(bare.sum()) / view.full.pixels, abs=2e-6)
     assert half == pytest.approx(whole / 2, abs=2e-6)
     assert whole > 1e-3
 
 
-def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer):
+def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing():
     gaussians, views = random_gaussians(80, seed=4, size=0.15), ring_of_views(4)
     tree = build_kd(gaussians.means, 3)
     table = InfluenceTable(tree, range(4), {}, "cpu")
-    found = weights(gaussians, rasterizer, [Shot(view, view.full) for view in views])
+    found = weights(gaussians, DRAW, [Shot(view, view.full) for view in views])
     table.note(gaussians.means, views[1:2], 2 * found[1:2])
     table.note(gaussians.means, views[:3], found[:3])
     table.note(gaussians.means, views[3:], found[3:] * torch.nan)  # a step that was no number

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings, Seen
+from abcd_ns.engine.layers.layer_renderer import RenderSettings, Seen
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.projection import SPLATS, Splats, extents_of
 from abcd_ns.engine.render.z_window import TileGrid
@@ -24,10 +24,10 @@ from abcd_ns.engine.space.visibility import (
     bounds_of,
     footprint,
 )
-from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
+from abcd_ns.engine.types import NEAR_PLANE, Crop, View
 from tests.engine.space.test_tree import SEEDS
-from tests.reference.scenes import WatchedScene, random_gaussians, ring_of_views
+from tests.reference.rasterizer_scenes import assert_same_layer
+from tests.reference.scenes import WatchedScene, random_gaussians, renderer_of, ring_of_views
 
 
 def small_view(seed: int = 0) -> View:
@@ -96,25 +96,25 @@ def drawn_in_box(view: View, crop: Crop, box: Box, splats: Splats) -> torch.Tens
     return (splats.radii > 0) & (drawn & inside).flatten(1).any(dim=1)
 
 
-def drawn_and_reached(seed: int, count: int, crop: Crop | None, lower: float, upper: list[float]):
+def drawn_and_reached(seed: int, count: int, crop: Crop | None = None):
     """Which Gaussians draw in a box around a point before the camera, and which are said to reach it."""
     view, gaussians = small_view(seed), random_gaussians(count, seed, size=0.22)
     gaussians.means[:] *= 3  # so that some are beside the camera, and behind it
     splats = TorchRasterizer(use_native=False).project(gaussians, view)
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
-    box = Box(middle + lower, torch.tensor(upper).double() + middle)
+    box = Box(middle - 0.7, middle + torch.tensor([math.inf, 0.5, 0.9]))
     reached = Optics([view], SPLATS.blur_pixels).reaches(gaussians.means, gaussians.scales, box)
     return drawn_in_box(view, crop or view.full, box, splats), reached
 
 
 @given(SEEDS, st.sampled_from([None, Crop(8, 5, 20, 13)]))
 def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, crop):
-    drawn, reached = drawn_and_reached(seed, 40, crop, -0.7, [math.inf, 0.5, 0.9])
+    drawn, reached = drawn_and_reached(seed, 40, crop)
     assert not bool((drawn & ~reached).any())
 
 
 def test_some_draw_in_a_box_and_some_do_not_reach_it():
-    drawn, reached = drawn_and_reached(1, 400, None, -1.2, [1.2, 1.2, 1.2])
+    drawn, reached = drawn_and_reached(1, 400)
     assert int(drawn.sum()) >= 20
     assert int(reached.sum()) < 400
 
@@ -124,23 +124,17 @@ def ahead(view, distance, count=1):
     return (view.center + distance * view.viewmat[2, :3]).expand(count, 3)
 
 
-NEAR_PLANES = {
-    "half the nearest distance": lambda v: ((ahead(v, 2.0), ahead(v, 0.8), ahead(v, 2.5)), 0.4),
-    "beside and behind": lambda v: (
-        (ahead(v, 2.0), ahead(v, 0.1) + 10 * v.viewmat[0, :3], ahead(v, -0.1)),
-        1.0,
-    ),
-    "a wrong match": lambda v: ((ahead(v, 2.0, 5000), ahead(v, 0.05)), 1.0),
-    "no point": lambda _: ((torch.zeros(0, 3),), NEAR_PLANE),
-    "all behind": lambda v: ((ahead(v, -5.0),), NEAR_PLANE),
-}
-
-
-@pytest.mark.parametrize("points", NEAR_PLANES.values(), ids=NEAR_PLANES)
-def test_the_near_plane_is_half_the_least_distance_that_a_photo_shows(points):
+def test_the_near_plane_is_half_the_least_distance_that_a_photo_shows():
     (view,) = ring_of_views(1)
-    given, expected = points(view)
-    assert as_trained([view], torch.cat(given))[0].near == pytest.approx(expected, rel=1e-2)
+    beside, wrong_match = ahead(view, 0.1) + 10 * view.viewmat[0, :3], ahead(view, 0.05)
+    for points, expected in (
+        ((ahead(view, 2.0), ahead(view, 0.8), ahead(view, 2.5)), 0.4),
+        ((ahead(view, 2.0), beside, ahead(view, -0.1)), 1.0),
+        ((ahead(view, 2.0, 5000), wrong_match), 1.0),
+        ((torch.zeros(0, 3),), NEAR_PLANE),
+        ((ahead(view, -5.0),), NEAR_PLANE),
+    ):
+        assert as_trained([view], torch.cat(points))[0].near == pytest.approx(expected, rel=1e-2)
 
 
 def test_a_camera_far_away_changes_little_for_the_others():
@@ -245,36 +239,27 @@ def test_too_wide_a_lens_switches_bounds_off():
     assert not optics.drawn_within([box]).isfinite().any()
 
 
-def street(blocks: int) -> Gaussians:
-    """Clusters in a row, far apart, each in a cell of its own."""
-    parts = []
-    for k in range(blocks):
-        part = random_gaussians(10, size=0.03, seed=k, dtype=torch.float64)
-        part.means[:, 0] += 40.0 * k
-        parts.append(part)
-    return Gaussians.cat(parts)
-
-
 @pytest.mark.parametrize("ownership", ["fragments", "means"])
 def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership):
-    gaussians = street(8)
+    """Of clusters in a row, far apart, each in a cell of its own."""
+    gaussians = random_gaussians(80, size=0.03, dtype=torch.float64)
+    gaussians.means[:, 0] += 40.0 * (torch.arange(80) // 10)
     views = ring_of_views(3, dtype=torch.float64)  # around the first cluster
     tree = build_kd(gaussians.means, 8)
     scene = WatchedScene(tree, gaussians)
-    renderer = LayerRenderer(scene, DRAW, ownership=ownership, pass_gaussians=0)
+    renderer = renderer_of(scene, DRAW, ownership=ownership)
     for view in views:
-        found = renderer.picture(view, SETTINGS)
-        expected = DRAW(gaussians, view, sh_degree=1).layer
-        assert torch.allclose(found.color, expected.color, atol=1e-12)
-        assert torch.allclose(found.transmittance, expected.transmittance, atol=1e-12)
+        assert_same_layer(renderer.picture(view, SETTINGS), DRAW(gaussians, view, sh_degree=1), atol=1e-12)
     assert len(set(scene.read)) < 8
     assert int(tree.assign(torch.zeros(1, 3))[0]) in scene.read
 
 
 def test_few_parts_are_held_while_nodes_are_folded():
-    gaussians, (view,) = random_gaussians(128), ring_of_views(1)
-    scene, seen = MemoryScene(build_kd(gaussians.means, 32), gaussians), Seen(view, view.full)
-    renderer, parts, most = LayerRenderer(scene, DRAW, ownership="means", pass_gaussians=0), {}, 0
+    (view,), parts, most = ring_of_views(1), {}, 0
+    seen, renderer = (
+        Seen(view, view.full),
+        renderer_of(random_gaussians(128), DRAW, blocks=32, ownership="means"),
+    )
     for node, shown in renderer.shown(renderer.nodes(0), [(view, view.full)], exclude=0).items():
         (parts[node],) = renderer.render(node, renderer.load(shown), [seen], SETTINGS, 0)
         renderer.fold_up(parts, node, seen)

@@ -25,7 +25,7 @@ def undisturbed(runs, tmp_path_factory):
 def test_a_run_killed_at_any_time_ends_as_it_would_have(runs, undisturbed, tmp_path, trial):
     seconds, folder = random.Random(trial).uniform(0.1, 2.0), tmp_path / "first"
     folder.mkdir()
-    while not runs.killed_after(seconds, folder):  # it was done by then: earlier, and from the start
+    while runs.finish(folder, within=seconds) == 0:  # it was done by then: earlier, and from the start
         seconds, folder = seconds / 2, folder.with_name(f"after-{seconds / 2:.4f}")
         folder.mkdir()
     assert lost_steps(folder) == 0
@@ -69,8 +69,7 @@ def test_a_run_that_the_disk_refuses_goes_on_when_there_is_room(runs, undisturbe
 
 
 def test_a_run_reaches_every_point_at_which_it_can_be_killed(tmp_path):
-    begun = points_reached(tmp_path)
-    resumed = points_reached(tmp_path)
+    begun, resumed = points_reached(tmp_path), points_reached(tmp_path)
     points = {point for name, point in vars(crash_points).items() if name.isupper()}
     of_checkpoints = {point for point in points if point.startswith("checkpoint")}
-    assert set(begun) | set(resumed) == points - of_checkpoints != points
+    assert begun | resumed == points - of_checkpoints != points

@@ -32,6 +32,7 @@ from tests.reference.scenes import (
     make_coordinator,
     random_gaussians,
     ring_of_views,
+    steps_of,
     whole_scene,
 )
 
@@ -93,11 +94,9 @@ def test_nothing_is_lost_when_gaussians_migrate(make, photos, start):
     coordinator = make(blocks=8, steps=60, density=STILL)
     generator = torch.Generator().manual_seed(0)
     ended = listen(coordinator, VisitEnded)
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        with torch.no_grad():
-            noise = torch.randn(coordinator.params["means"].shape, generator=generator)
-            coordinator.params["means"].add_(0.05 * noise)
+    for _ in steps_of(coordinator, photos):
+        means = coordinator.params["means"].detach()
+        means += 0.05 * torch.randn(means.shape, generator=generator)
         assert coordinator.count() == len(start)
         if coordinator.state.active is None:
             for b in range(8):
@@ -111,8 +110,7 @@ def test_migrants_take_their_moments_along(make, photos):
     while coordinator.state.active is None or coordinator.run.active.done < coordinator.run.active.steps - 1:
         train_step(coordinator, photos)
     other = 1 - coordinator.run.active.geometry.block
-    with torch.no_grad():
-        coordinator.params["means"][0] = coordinator.scene.gaussians(other).means[0]
+    coordinator.params["means"].detach()[0] = coordinator.scene.gaussians(other).means[0]
     moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
     row = coordinator.params["scales"][0].detach().clone()
     arrived_before, stored = coordinator.scene.count(other), coordinator.scene.state(other)
@@ -138,14 +136,14 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, bloc
 def test_blocks_that_no_view_sees_are_left_alone(make, photos, start):
     start.means[:20] += 50.0
     coordinator = make(blocks=8, steps=40)
-    unseen = [b for b in range(8) if bool((coordinator.scene.gaussians(b).means > 40).all())]
+    blocks = {block: coordinator.scene.gaussians(block) for block in range(8)}
+    unseen = {block: before for block, before in blocks.items() if bool((before.means > 40).all())}
     assert unseen
-    before = [coordinator.scene.gaussians(b) for b in unseen]
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)
-    assert not {event.block for event in begun} & set(unseen)
-    assert all(coordinator.state.views[b] == 0 for b in unseen)
-    assert all(equal(coordinator.scene.gaussians(b), g) for b, g in zip(unseen, before, strict=True))
+    assert not {event.block for event in begun} & unseen.keys()
+    assert all(coordinator.state.views[block] == 0 for block in unseen)
+    assert all(equal(coordinator.scene.gaussians(block), before) for block, before in unseen.items())
 
 
 def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(make, photos):
@@ -157,9 +155,9 @@ def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(make,
     come = coordinator.scene.state(unseen)[:3]
     coordinator.run.persist(coordinator.scene.tree, {PENDING: come}, within=0.0)
     assert coordinator.scene.pending_for(unseen) is not None
-    begun = listen(coordinator, VisitBegan)
+    begun = listen(coordinator, VisitBegan, lambda event: event.block)
     train(coordinator, photos)
-    assert unseen in {event.block for event in begun}
+    assert unseen in begun
     assert coordinator.state.views[unseen] > 0
 
 
@@ -183,10 +181,7 @@ def test_a_limit_on_gaussians_is_kept_at_every_step(make, photos, start):
     limit = len(start) + 15
     density = replace(UNPRUNED, max_gaussians=limit, cull_alpha_thresh=0.0)
     coordinator = make(blocks=2, steps=60, density=density)
-    counts = []
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        counts.append(coordinator.count())
+    counts = [coordinator.count() for _ in steps_of(coordinator, photos)]
     assert len(start) < counts[-1] <= max(counts) <= limit
 
 
@@ -253,19 +248,14 @@ def test_an_oversized_gaussian_is_trained_where_it_reaches_out_of_its_cell(make,
 def test_layers_show_what_earlier_visits_made_of_the_other_blocks(make, photos):
     """Invariant 6: whenever a visit begins, its pictures are those of the whole scene as it is by then."""
     coordinator = make(blocks=4, window_weight=0.0, visit_steps=2)
-    render, begun = coordinator.render, 0
-
-    def compared(batch):
-        nonlocal begun
-        rendered = render(batch)
+    begun = 0
+    while not coordinator.finished:
+        batch = coordinator.next_batch()
         if coordinator.run.active.done == 0:
             begun += 1
-            for off in off_from_merged(coordinator, batch, rendered.pictures):
+            for off in off_from_merged(coordinator, batch, coordinator.render(batch).pictures):
                 assert float(off.max()) < 1e-3  # of half floats
-        return rendered
-
-    coordinator.render = compared
-    train(coordinator, photos)
+        train_step(coordinator, photos)
     assert begun > 4
 
 
@@ -277,11 +267,9 @@ def test_pictures_of_any_size_train_together(tmp_path):
     rings = [ring_of_views(len(sizes), width=width, height=height) for width, height in sizes]
     views = [ring[index] for index, ring in enumerate(rings)]
     photos = Photos(random_gaussians(60, seed=7, size=0.1), views)
-    density = DensityConfig(refine_start=0.0)
-    start = random_gaussians(60, seed=1, size=0.08)
+    start, density = random_gaussians(60, seed=1, size=0.08), DensityConfig(refine_start=0.0)
     coordinator = make_coordinator(tmp_path, start, views, steps=24, density=density)
-    while not coordinator.finished:
-        train_step(coordinator, photos)
+    train(coordinator, photos)
     assert not bool(unsound(whole_scene(coordinator)).any())
 
 

@@ -1,6 +1,7 @@
 """When a block grows, by its own clock and by the run's, and how."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -116,13 +117,7 @@ def test_every_run_is_refined_about_4_to_150_times_and_20_where_all_views_were_d
 
 @pytest.mark.parametrize(
     ("run", "views", "given", "expected"),
-    [
-        (7000, 147, 0, 147),
-        (7000, 300, 0, 300),
-        (30_000, 700, 0, 700),
-        (3000, 20, 100, 100),
-        (3000, 130, 100, 130),
-    ],
+    [(7000, 147, 0, 147), (30_000, 700, 0, 700), (3000, 20, 100, 100), (3000, 130, 100, 130)],
 )
 def test_a_block_is_refined_whenever_its_views_or_as_many_as_given_were_drawn(run, views, given, expected):
     found = refinements(run, views, refine_every=given)
@@ -139,38 +134,32 @@ def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
     """It was refined in the warm-up, just now perhaps; later visits count from the one before."""
     control, batch = DensityControl(DensityConfig()), 4
 
-    def due(first: bool) -> list[int]:
-        drawn = batch * steps
-        options = {"refined": 1000, "taken": batch, "views": drawn, "visit": drawn}
-        each = (
-            clock(steps=1000 + batch * k, spent=k / steps, first=first, **options)
-            for k in range(1, steps + 1)
-        )
-        return [k for k, at in enumerate(each, start=1) if control.is_due(at)]
+    def is_ever_due(first: bool) -> bool:
+        given = {"refined": 1000, "taken": batch, "views": batch * steps, "visit": batch * steps}
+        clocks = (clock(steps=1000 + batch * k, spent=k / steps, **given) for k in range(1, steps + 1))
+        return any(control.is_due(replace(at, first=first)) for at in clocks)
 
-    assert due(first=True)
-    assert not due(first=False)
+    assert is_ever_due(first=True)
+    assert not is_ever_due(first=False)
 
 
 def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_it_missed():
     control = DensityControl(DensityConfig(refine_every=30))
-    late = {"views": 20, "taken": 4, "refined": 100, "spent": 0.6}
-    assert not control.is_due(clock(steps=128, **{**late, "spent": 0.1}))
-    assert control.is_due(clock(steps=132, **{**late, "spent": 0.1}))
-    assert not control.is_due(clock(steps=132, **late))
-    assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
-    assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))
+    at = clock(views=20, taken=4, refined=100, spent=0.1)
+    assert not control.is_due(replace(at, steps=128))
+    assert control.is_due(replace(at, steps=132))
+    assert not control.is_due(replace(at, steps=132, spent=0.6))
+    assert control.is_due(replace(at, steps=190))  # overdue: no multiple of 30 is here
+    assert not control.is_due(replace(at, steps=19, refined=0, views=40))
 
 
 def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
-    late = {"progress": 0.6, "refined": 0, "spent": 0.1}
+    late = clock(progress=0.6, refined=0, spent=0.1, first=True)
     control = DensityControl(DensityConfig())
-    assert control.is_due(clock(first=True, **late))
-    assert not control.is_due(clock(first=True, **{**late, "progress": 0.71}))
-    assert not control.is_due(clock(**late))
-    assert not control.is_due(clock(first=True, **{**late, "spent": 0.6}))
-    never = DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0))
-    assert not never.is_due(clock(first=True, **late))
+    assert control.is_due(late)
+    for changes in ({"progress": 0.71}, {"first": False}, {"spent": 0.6}):
+        assert not control.is_due(replace(late, **changes))
+    assert not DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0)).is_due(late)
 
 
 def test_a_block_is_refined_less_often_where_a_picture_shows_little_of_it():

@@ -14,7 +14,7 @@ from abcd_ns.engine.train.run_state import BlockHealth, Budget, Stopwatch
 from abcd_ns.engine.train.schedule import plan_epoch, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import STILL, UNPRUNED, assert_resumes, listen, stop
+from tests.reference.scenes import STILL, UNPRUNED, assert_resumes, listen, steps_of, stop
 
 
 def narrow(views):
@@ -27,18 +27,13 @@ def test_who_is_hidden_is_no_part_of_an_epoch_until_looked_at_again(make, photos
     coordinator = make(blocks=4, steps=10_000, density=STILL)
     ended, began = listen(coordinator, EpochEnded), listen(coordinator, VisitBegan)
     while not ended:
-        train(coordinator, photos, steps=1)
-    for block in range(4):
-        for other in {0, 1, 2, 3} - {block}:
-            coordinator.state.health[other] = BlockHealth(hidden=True)
-        before = len(ended)
-        while len(ended) == before:
-            train(coordinator, photos, steps=1)
-        epoch = ended[-1].epoch
-        assert epoch == before
-        expected = {block} if epoch % LOOK_AGAIN else {0, 1, 2, 3}
+        train_step(coordinator, photos)
+    for epoch in range(1, 5):
+        coordinator.state.health = {block: BlockHealth(hidden=block > 0) for block in range(4)}
+        while ended[-1].epoch < epoch:
+            train_step(coordinator, photos)
+        expected = {0} if epoch % LOOK_AGAIN else {0, 1, 2, 3}
         assert {visit.block for visit in began if visit.epoch == epoch} == expected
-        coordinator.state.health.clear()
 
 
 @pytest.mark.parametrize("many", [100, 0])
@@ -133,8 +128,7 @@ def test_the_last_epoch_shares_views_also_where_steps_draw_different_numbers(mak
 def test_views_that_are_drawn_one_after_the_other_train_the_same(make, photos):
     options = {"blocks": 3, "steps": 40, "batch": 4, "light": "affine"}
     together, apart = make("together", **options), make("apart", batch_limit=3, **options)
-    parts = [len(part.samples) for part in apart.next_batch().parts()]
-    assert (max(parts), sum(parts)) == (3, 4)
+    assert sorted(len(part.samples) for part in apart.next_batch().parts()) == [1, 3]
     for coordinator in (together, apart):
         train(coordinator, photos, steps=12)
     assert len(together.params["means"]) == len(apart.params["means"])
@@ -148,8 +142,7 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photo
     monkeypatch.setattr("abcd_ns.engine.train.schedule.DECAY_VIEWS", 1)  # these see a few dozen
     coordinator = make(blocks=7, steps=55, density=STILL, visit_steps=5, fast_start=True)
     began, rates = listen(coordinator, VisitBegan), dict[int, set[float]]()
-    while not coordinator.finished:
-        train(coordinator, photos, steps=1)
+    for _ in steps_of(coordinator, photos):
         rates.setdefault(began[-1].visit, set()).add(coordinator.optimizers["quats"].param_groups[0]["lr"])
     first, second = [rates[visit.visit] for visit in began[:7]], [rates[visit.visit] for visit in began[7:]]
     assert sorted(visit.block for visit in began[:7]) == list(range(7))
@@ -163,8 +156,7 @@ def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make,
     density = replace(UNPRUNED, refine_stop=0.01, refine_every=1)
     coordinator = make(blocks=2, steps=60, coarse_model=40, visit_steps=8, density=density)
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
-    while not coordinator.finished:
-        train_step(coordinator, photos)
+    for _ in steps_of(coordinator, photos):
         active, block = coordinator.state.active, coordinator.visit.block
         if active is not None and not active.is_whole:
             counts[block.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(block))
@@ -177,9 +169,7 @@ def test_moments_are_forgotten_at_the_next_visit_only_when_asked(make, photos, k
     coordinator = make(blocks=2, steps=30, visit_steps=3, batch=1, density=STILL, keep_moments=keep)
     train(coordinator, photos, steps=6)
     coordinator.next_batch()
-    block = coordinator.state.active.geometry.block
-    stored = coordinator.scene.state(block)
-    assert stored.clocks.adam_views == 3
+    assert coordinator.scene.clocks(coordinator.state.active.geometry.block).adam_views == 3
     adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
     assert int(adam["step"]) == (3 if keep else 0)
     assert bool(adam["exp_avg"].any()) == keep
@@ -192,9 +182,8 @@ def test_a_run_without_moments_can_be_resumed_within_a_visit(make, photos):
 
 
 def test_the_degree_begins_at_0_in_every_visit_and_layers_have_the_highest(make, photos):
-    options = {"visit_steps": 4, "batch": 1, "density": STILL, "sh_restart": True, "sh_ramp": 0.5}
-    coordinator = make(blocks=2, steps=16, **options)
-    degrees = []
+    options = {"visit_steps": 4, "batch": 1, "sh_restart": True, "sh_ramp": 0.5}
+    coordinator, degrees = make(blocks=2, steps=16, **options), []
     while not coordinator.finished:
         coordinator.next_batch()
         degrees.append(coordinator.run.sh_degree)
@@ -203,15 +192,14 @@ def test_the_degree_begins_at_0_in_every_visit_and_layers_have_the_highest(make,
     assert degrees == [0, 0, 1, 1] * 4
 
 
-@pytest.mark.parametrize("migrate", [True, False])
-def test_leavers_are_deleted_only_when_asked(make, photos, migrate):
-    coordinator = make(blocks=2, steps=8, visit_steps=4, batch=1, density=STILL, migrate=migrate)
+def test_leavers_are_deleted_when_asked(make, photos):
+    """Else they migrate: test_coordinator."""
+    coordinator = make(blocks=2, steps=8, visit_steps=4, batch=1, density=STILL, migrate=False)
     train(coordinator, photos, steps=3)
     block = coordinator.state.active.geometry.block
-    with torch.no_grad():
-        coordinator.params["means"][:5] = coordinator.scene.gaussians(1 - block).means[:5]
+    coordinator.params["means"].detach()[:5] = coordinator.scene.gaussians(1 - block).means[:5]
     train(coordinator, photos, steps=1)
-    assert coordinator.count() == (120 if migrate else 115)
+    assert coordinator.count() == 115
     means = coordinator.scene.gaussians(block).means
     assert bool((coordinator.scene.tree.assign(means) == block).all())
 

@@ -1,6 +1,7 @@
 """When a run is complete, what its training views hardly miss goes, and no more than they can spare."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -29,12 +30,7 @@ def scene() -> Gaussians:
 @pytest.fixture
 def begin(make, photos):
     given = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "target": photos.target}
-    given["background"] = "black"
-
-    def begun(name: str = "run", start: Gaussians | None = None, **options):
-        return make(name, start=start or scene(), **{**given, **options})
-
-    return begun
+    return partial(make, start=scene(), background="black", **given)
 
 
 @pytest.fixture
@@ -117,10 +113,9 @@ def test_black_things_are_missed_where_training_has_other_backgrounds(begin, pho
     def black(view, crop):
         return 0 * photos(view, crop)
 
-    left = {}
+    left, given = {}, {"steps": 2, "target": lambda sample: (black(sample.view.index, sample.crop), None)}
     for color in ("random", "black"):
-        given = {"steps": 2, "target": lambda sample: (black(sample.view.index, sample.crop), None)}
-        coordinator = begin(color, start, background=color, **given)
+        coordinator = begin(color, start=start, background=color, **given)
         told = listen(coordinator, PrunedAtEnd)
         train(coordinator, black)
         left[color] = told[0].gaussians

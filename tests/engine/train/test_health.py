@@ -14,20 +14,15 @@ from abcd_ns.engine.train.memory import ACTIVE_COPIES, OutOfRoomError, check_roo
 from abcd_ns.engine.train.step.active_block import LARGEST
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
-from tests.reference.scenes import STILL, UNPRUNED, listen, random_gaussians, stop, whole_scene
-
-
-def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
-    """The row's gradient of one parameter is `value` in every step: a hook that runs before all others."""
-    optimizer = coordinator.optimizers[name]
-
-    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
-        gradient = optimizer.param_groups[0]["params"][0].grad
-        if gradient is not None and len(gradient) > row:
-            gradient[row] = value
-
-    handle = optimizer.register_step_pre_hook(spoil)
-    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
+from tests.reference.scenes import (
+    STILL,
+    UNPRUNED,
+    listen,
+    random_gaussians,
+    spoil_gradients,
+    stop,
+    whole_scene,
+)
 
 
 @pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (1e30, 1)])
@@ -49,9 +44,8 @@ def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, ph
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
     before, told = coordinator.scene.stored_with_pending(block), listen(coordinator, Repaired)
-    with torch.no_grad():
-        coordinator.params["means"][4, 1] = math.nan
-        coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
+    coordinator.params["means"].detach()[4, 1] = math.nan
+    coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
     squares = coordinator.optimizers["quats"].state[coordinator.params["quats"]]["exp_avg_sq"]
     kept = squares[1].clone()
     squares[0] = math.inf
@@ -72,8 +66,7 @@ def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos)
     attached = listen(coordinator, VisitBegan)
     while not attached or len(coordinator.params["means"]) == attached[-1].gaussians:
         train_step(coordinator, photos)
-    with torch.no_grad():
-        coordinator.params["scales"][0] = 100.0
+    coordinator.params["scales"].detach()[0] = 100.0
     coordinator.save()
     assert bool(torch.isfinite(coordinator.params["scales"]).all())
     assert float(torch.sigmoid(coordinator.params["opacities"].detach()[0])) < 1 / 255
@@ -83,10 +76,9 @@ def test_oversized_gaussians_shrink_to_what_the_nearest_camera_sees_of_them(make
     coordinator = make(blocks=2, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
-    with torch.no_grad():
-        scales[0] = torch.tensor([5.0, -3.0, 5.0])
-        means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
-        scales[2] = 5.0  # spared
+    scales[0] = torch.tensor([5.0, -3.0, 5.0])
+    means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
+    scales[2] = 5.0  # spared
     told, kept = listen(coordinator, Repaired), scales[2:].clone()
     coordinator.health.shrink_oversized(views, torch.arange(len(scales)) == 2)
     assert [(event.what, event.count) for event in told] == [("oversized", 1)]
@@ -107,15 +99,13 @@ def test_oversized_gaussians_shrink_before_their_block_is_trained_and_none_grows
     train(coordinator, photos, steps=18)
     assert {event.what for event in told} == {"oversized"}
     told.clear()
-    with torch.no_grad():
-        coordinator.params["scales"][1] = 5.0
+    coordinator.params["scales"].detach()[1] = 5.0
     train(coordinator, photos)
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
     assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * OVERSIZED_ANGLE
     assert not told
-    states = [coordinator.scene.state(block) for block in range(blocks)]
-    assert all(LARGEST not in state.growth for state in states)
+    assert all(LARGEST not in coordinator.scene.state(block).growth for block in range(blocks))
 
 
 def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
@@ -125,12 +115,9 @@ def test_what_fills_much_of_its_views_may_be_oversized(make, views, photos):
     block = coordinator.visit.block
     block.growth = {"weight": torch.zeros(len(block)), "passes": torch.ones(len(block))}
     block.growth["weight"][0] = 0.02 * sum(view.full.pixels for view in views)
-    with torch.no_grad():
-        coordinator.params["scales"][:2] = 5.0
-    train_step(coordinator, photos)
-    with torch.no_grad():
-        coordinator.params["scales"][:2] = 6.0
-    train_step(coordinator, photos)
+    for scale in (5.0, 6.0):
+        coordinator.params["scales"].detach()[:2] = scale
+        train_step(coordinator, photos)
     assert coordinator.params["scales"][:2].amax(dim=1).tolist() == pytest.approx([6.0, 5.0], abs=0.1)
 
 
@@ -155,13 +142,12 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos,
 @pytest.mark.parametrize("blocks", [1, 3])
 def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks):
     """All its Gaussians may be pruned; the run goes on, and can be resumed."""
-    density = DensityConfig(refine_start=0.0)
-    options = {"blocks": blocks, "steps": 30, "density": density}
+    options = {"blocks": blocks, "steps": 30, "density": DensityConfig(refine_start=0.0)}
     coordinator = make(**options)
     train(coordinator, photos, steps=2)
-    nobody = coordinator.visit.block.detached()[:0]
-    attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
-    coordinator.visit.block.growth = {}
+    block = coordinator.visit.block
+    attach(block.detached()[:0], coordinator.params, coordinator.optimizers, batch=coordinator.batch)
+    block.growth = {}
     batch = coordinator.next_batch()
     wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
     assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad
@@ -188,8 +174,7 @@ def test_a_visit_that_time_ran_out_on_says_nothing_of_whether_the_block_is_hidde
 def test_a_value_that_is_no_number_bounds_nothing(make, views, photos):
     coordinator = make(blocks=1, steps=30, density=STILL)
     train_step(coordinator, photos)
-    with torch.no_grad():
-        coordinator.params["means"][0] = coordinator.params["scales"][1] = math.nan
+    coordinator.params["means"].detach()[0] = coordinator.params["scales"].detach()[1] = math.nan
     nobody = torch.zeros(len(coordinator.params["means"]), dtype=torch.bool)
     largest = coordinator.health.largest(views, nobody)
     assert bool((largest[:2] > 40).all())

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
+from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
@@ -14,7 +15,14 @@ from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.world.world import camera
 from tests.engine.train.test_coordinator import off_from_merged
-from tests.reference.scenes import STILL, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    STILL,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 
 PRICED = DensityConfig(min_contribution=1.0, refine_every=1000)
 
@@ -51,14 +59,11 @@ def blindfold(coordinator, monkeypatch, blind: tuple[int, ...]) -> None:
 
 def visits_of(coordinator) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
     """(block, views, those that are looked at because they are doubtful), which grows as visits begin."""
-    seen = []
 
     def note(event):
-        if isinstance(event, VisitBegan) and event.block is not None:
-            seen.append((event.block, coordinator.state.active.views, coordinator.state.active.looked_at))
+        return event.block, coordinator.state.active.views, coordinator.state.active.looked_at
 
-    coordinator.announce.subscribe(note)
-    return seen
+    return listen(coordinator, VisitBegan, note)
 
 
 def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(grown, photos):
@@ -117,17 +122,16 @@ def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(gro
 
 
 def test_when_the_warm_up_is_over_nothing_of_it_stays_active(begin, photos):
-    coordinator, seen = begin(), []
+    coordinator = begin()
 
-    def note(event):
-        if isinstance(event, VisitEnded) and event.block is None:
-            for name, parameter in coordinator.params.items():
-                moments = coordinator.optimizers[name].state[parameter]
-                seen.append([len(parameter), len(moments["exp_avg"]), len(moments["exp_avg_sq"])])
+    def rows(_) -> set[int]:
+        moments = (coordinator.optimizers[name].state[p] for name, p in coordinator.params.items())
+        held = [*coordinator.params.values(), *(each[name] for each in moments for name in MOMENTS)]
+        return {len(tensor) for tensor in held}
 
-    coordinator.announce.subscribe(note)
-    train(coordinator, photos, steps=20)
-    assert seen == [[0, 0, 0]] * 6
+    ended = listen(coordinator, VisitEnded, rows)
+    train(coordinator, photos, steps=12)
+    assert ended == [{0}]
 
 
 def test_views_that_show_a_block_no_more_are_found_out(grown, monkeypatch):
@@ -140,9 +144,8 @@ def test_views_that_show_a_block_no_more_are_found_out(grown, monkeypatch):
         assert not set(active.views) & set(blind)
 
 
-def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
-    start, views = random_gaussians(60, seed=3), ring_of_views(4)
-    run = make_coordinator(tmp_path, start, views, blocks=4, steps=80)
+def test_the_block_that_shares_least_with_those_that_are_out_is_next(make):
+    run = make(blocks=4, steps=80)
     first = run.visits.begin(at_once=2)
     queued = [plan.block for plan in run.state.queue]
     everywhere, elsewhere = {0: 0.5, 1: 0.5}, {2: 0.1, 3: 0.1}

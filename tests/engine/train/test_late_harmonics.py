@@ -6,7 +6,7 @@ from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use
 from abcd_ns.engine.train.memory import limits_at
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import STILL, assert_resumes, whole_scene
+from tests.reference.scenes import STILL, assert_resumes, steps_of, whole_scene
 
 LATE = {"blocks": 4, "steps": 96, "density": STILL, "late_harmonics": 2}
 ROOMY, TIGHT = 1000, 34
@@ -24,8 +24,7 @@ def highest_of(coordinator) -> int:
 
 def test_what_is_active_has_no_more_harmonics_than_are_in_use(make, photos, start):
     coordinator, found = make(block_limit=ROOMY, **LATE), set()
-    while not coordinator.finished:
-        train_step(coordinator, photos)
+    for _ in steps_of(coordinator, photos):
         if coordinator.state.active is not None:
             found.add((coordinator.run.share < 0.5, active_gaussians(coordinator.params).sh_degree))
     assert {degree for is_early, degree in found if is_early} == {0}

@@ -23,9 +23,9 @@ from abcd_ns.engine.train.density.pruning import (
     veils,
 )
 from abcd_ns.engine.train.schedule import evenly
-from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, View
-from tests.reference.scenes import activated, listen, random_gaussians, whole_scene
+from tests.reference.scenes import activated, listen, random_gaussians, steps_of, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 """Nothing grows, and the minimum is the full one from the beginning."""
@@ -118,8 +118,8 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos):
 
 def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_prunes(make, photos):
     start = random_gaussians(60, seed=7, size=0.12)
-    faint = torch.arange(60) % 3 == 0
-    start = replace(start, opacities=torch.where(faint[:, None], -6.0, 1.0))  # a sigmoid of 1/404
+    start.opacities[:] = 1.0
+    start.opacities[::3] = -6.0  # a sigmoid of 1/404
     coordinator = make(start=start, blocks=2, steps=12, density=replace(STILL, min_contribution=1e-6))
     train(coordinator, photos)
     left = whole_scene(coordinator)
@@ -235,12 +235,10 @@ def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
 
 
 def test_one_block_prunes_after_every_so_many_passes(make, views, photos):
-    first, counts = PASSES * len(views), []
+    first = PASSES * len(views)
     density = replace(STILL, min_contribution=1e-9)
     coordinator = make(start=some_hidden(), blocks=1, steps=3 * first, density=density, batch=1)
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        counts.append(coordinator.count())
+    counts = [coordinator.count() for _ in steps_of(coordinator, photos)]
     assert counts[first - 2] == 120
     assert counts[first - 1] <= 120 - HIDDEN
     assert math.isclose(counts[-1], counts[first - 1], abs_tol=5)

@@ -14,7 +14,7 @@ from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import ALIGN, Sample, part_to_draw, random_part
-from abcd_ns.engine.types import Crop, View
+from abcd_ns.engine.types import Crop
 from tests.reference.scenes import STILL, assert_resumes, random_gaussians, ring_of_views, training_config
 
 CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
@@ -125,10 +125,6 @@ def test_a_run_on_reduced_parts_that_stops_and_goes_on_is_the_run_that_did_not(m
     assert_resumes(make, photos, 6, blocks=4, steps=14, crop_pixels=600, coarse=0.7)
 
 
-def sample_of(view: View, crop: Crop) -> Sample:
-    return Sample(view, crop, None, None, torch.zeros(3))
-
-
 def test_pictures_grow_by_share_and_never_become_too_small():
     shares = [0.0, 0.19, 0.2, 0.39, 0.4, 1.0]
     assert [reduction_at(share, 0.4, 640) for share in shares] == [4, 4, 2, 2, 1, 1]
@@ -150,7 +146,7 @@ def test_a_reduced_camera_sees_the_same_in_larger_pixels(by):
 
 def test_a_reduced_photo_is_the_mean_of_its_squares():
     (view,) = ring_of_views(1)
-    sample = sample_of(view.reduced(4), Crop(2, 1, 5, 6))
+    sample = Sample(view.reduced(4), Crop(2, 1, 5, 6), None, None, torch.zeros(3))
     assert sample.source == Crop(8, 4, 20, 24)
     photo = torch.rand(24, 20, 3)
     expected = photo.view(6, 4, 5, 4, 3).mean(dim=(1, 3))
@@ -159,7 +155,7 @@ def test_a_reduced_photo_is_the_mean_of_its_squares():
 
 def test_alpha_and_masks_are_reduced_with_what_they_stand_for():
     (view,) = ring_of_views(1)
-    sample = sample_of(view.reduced(2), Crop(0, 0, 3, 2))
+    sample = Sample(view.reduced(2), Crop(0, 0, 3, 2), None, None, torch.zeros(3))
     photo, behind = torch.rand(4, 6, 4), torch.rand(3)
     photo[:2, :2, 3] = 0.0
 

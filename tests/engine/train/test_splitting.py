@@ -1,5 +1,6 @@
 """Blocks that outgrow their limit are cut in two: nothing lost, bounded, resumable."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +15,15 @@ from abcd_ns.engine.train.recipe import FULL, Limits
 from abcd_ns.engine.train.run_state import BlockHealth, RunState, standing
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import GROWING, STILL, assert_resumes, listen, random_gaussians, whole_scene
+from tests.reference.scenes import (
+    GROWING,
+    STILL,
+    assert_resumes,
+    listen,
+    random_gaussians,
+    steps_of,
+    whole_scene,
+)
 
 
 def rows(state: BlockState) -> set[tuple[float, ...]]:
@@ -26,8 +35,7 @@ def test_parts_are_small_enough_and_hold_everything(limit):
     gaussians = random_gaussians(300)
     tree = build_kd(gaussians.means, 3)
     owner = tree.assign(gaussians.means)
-    updates = {b: BlockState.fresh(gaussians[owner == b]) for b in range(3)}
-    updates = {b: BlockState(s.gaussians, s.exp_avg, s.exp_avg_sq, {}, Clocks(b)) for b, s in updates.items()}
+    updates = {b: replace(BlockState.fresh(gaussians[owner == b]), clocks=Clocks(b)) for b in range(3)}
     cut, parts, parents = split_full(tree, updates, Limits(limit))
     assert all(len(state) <= FULL * limit for state in parts.values())
     assert set().union(*map(rows, parts.values())) == rows(BlockState.fresh(gaussians))
@@ -72,16 +80,11 @@ def test_a_run_never_has_a_larger_block_than_it_may(make, photos, monkeypatch):
     monkeypatch.setattr(control, "MOST_NEW", 1.0)
     limit, blocks = 130, 2
     coordinator = make(blocks=blocks, steps=50, density=GROWING, block_limit=limit, warmup=0.0)
-    seen, largest = listen(coordinator, object), 0
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        largest = max(largest, len(coordinator.params["means"]))
-    cuts = [event for event in seen if isinstance(event, BlockSplit)]
-    assert cuts
-    assert largest <= limit
+    cuts, begun = listen(coordinator, BlockSplit), listen(coordinator, VisitBegan, lambda event: event.block)
+    assert max(len(coordinator.params["means"]) for _ in steps_of(coordinator, photos)) <= limit
     tree = coordinator.scene.tree
-    assert tree.num_blocks == blocks + len(cuts)
-    assert {event.block for event in seen if isinstance(event, VisitBegan)} >= {cut.new for cut in cuts[:1]}
+    assert tree.num_blocks == blocks + len(cuts) > blocks
+    assert cuts[0].new in begun
     assert coordinator.scene.store.header["tree"] == tree.to_json()
     for block in range(tree.num_blocks):
         means = coordinator.scene.stored_with_pending(block).means
