@@ -1,5 +1,6 @@
 """Gaussians in another frame of coordinates."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -52,7 +53,7 @@ class Frame:
         moved = replace(
             gaussians,
             means=self.points(like),
-            scales=gaussians.scales.double() + torch.tensor(self.scale).double().log(),
+            scales=gaussians.scales.double() + math.log(self.scale),
             quats=quats,
             features_rest=torch.einsum("ij,njc->nic", turn, rest),
         )

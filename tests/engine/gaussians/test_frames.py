@@ -30,4 +30,4 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moves_along(seed):
     before = draw(gaussians, view, sh_degree=3)
     after = draw(frame.gaussians(gaussians), replace(view, viewmat=moved), sh_degree=3)
     assert float(before.color.max()) > 0.05
-    assert_same_layer(after, before, atol=1e-6)
+    assert_same_layer(after, before, atol=1e-9)
