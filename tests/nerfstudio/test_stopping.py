@@ -9,14 +9,6 @@ import pytest
 from abcd_ns.nerfstudio.run.stopping import StopSignals, command_to_resume, next_steps
 
 
-@pytest.fixture(autouse=True)
-def python_handles_interrupts():
-    """Also where the tests run in the background of a shell, which has them ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def test_handlers_are_put_back():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with StopSignals():
