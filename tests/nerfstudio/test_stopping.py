@@ -1,7 +1,7 @@
 """A signal ends a run between two steps, and the line that says how to go on is one that can be typed."""
 
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -48,13 +48,9 @@ def test_what_is_next_are_commands_about_the_run():
 
 
 def test_in_another_thread_signals_stay_as_they_are():
-    before, seen = signal.getsignal(signal.SIGTERM), []
-
-    def enter() -> None:
+    def handler() -> object:
         with StopSignals():
-            seen.append(signal.getsignal(signal.SIGTERM))
+            return signal.getsignal(signal.SIGTERM)
 
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert seen == [before]
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(handler).result() == signal.getsignal(signal.SIGTERM)
