@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,14 +161,11 @@ def the(name: str, found: Survey) -> Finding:
     return finding
 
 
-def changed(found: Survey, pose: Callable | None = None, points: np.ndarray | None = None) -> Survey:
-    """The survey of a scene with other poses, `pose(row, 3 x 4)`, or other points."""
+def changed(found: Survey, poses: np.ndarray | None = None, points: np.ndarray | None = None) -> Survey:
+    """The survey of a scene with other poses [n, 3, 4], or other points."""
     prepared, scene = found.prepared, found.prepared.scene
-    if pose is not None:
-        moved = [
-            replace(frame, camera_to_world=pose(row, frame.camera_to_world.copy()))
-            for row, frame in enumerate(scene.frames)
-        ]
+    if poses is not None:
+        moved = [replace(f, camera_to_world=pose) for f, pose in zip(scene.frames, poses, strict=True)]
         prepared = replace(prepared, scene=replace(scene, frames=moved))
     if points is not None:
         prepared = replace(prepared, points_in_model=points)
@@ -240,20 +237,12 @@ def test_focal_lengths_of_other_worlds(found):
 
 def test_poses_that_are_doubtful(found):
     middle, names = found.centers.mean(axis=0), found.names
-
-    def away(row: int, pose: np.ndarray) -> np.ndarray:
-        pose[:, 3] += 1000 * (row == 4)
-        return pose
-
-    def in_one_place(_: int, pose: np.ndarray) -> np.ndarray:
-        pose[:, 3] = middle + 1e-3 * (pose[:, 3] - middle)
-        return pose
-
-    def averted(row: int, pose: np.ndarray) -> np.ndarray:
-        if row == 3:
-            pose[:, [0, 2]] *= -1
-        return pose
-
+    away, in_one_place, averted = (
+        np.stack([frame.camera_to_world for frame in found.prepared.scene.frames]) for _ in range(3)
+    )
+    away[4, :, 3] += 1000
+    in_one_place[:, :, 3] = middle + 1e-3 * (in_one_place[:, :, 3] - middle)
+    averted[3][:, [0, 2]] *= -1
     assert names[4] in the("far-cameras", changed(found, away)).what
     assert "no depth can be told" in the("one-place", changed(found, in_one_place)).what
     assert f"{names[3]} (0)" in the("views-with-few-points", changed(found, averted)).what

@@ -1,8 +1,6 @@
 """`abcd poses`: photos alone become a data set, and what cannot is said."""
 
 import os
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -39,34 +37,24 @@ def corner_of_a_room(place: np.ndarray, textures: np.ndarray) -> Image.Image:
     return Image.fromarray(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
 
 
-@pytest.fixture(scope="module")
-def places() -> dict[str, np.ndarray]:
-    """Where the photos are taken from, by name."""
-    angles = np.linspace(0.35, 1.25, 12)
-    return {
-        f"{n:02d}.png": np.array([3 * np.cos(a), 3 * np.sin(a), 1.2 + 0.1 * (n % 3)])
-        for n, a in enumerate(angles)
-    }
-
-
-@pytest.fixture(scope="module")
-def found(places, tmp_path_factory) -> Path:
-    """Photos, through `abcd poses`."""
-    data = tmp_path_factory.mktemp("found") / "scene"
-    (data / "images").mkdir(parents=True)
+def write_photos(folder: Path) -> dict[str, np.ndarray]:
+    """Write twelve photos; returns where they are taken from, by name."""
+    folder.mkdir()
     noise = np.random.default_rng(0).normal(size=(3, 400, 400))
     smooth = sum(gaussian_filter(noise, (0, s, s)) * s for s in (1.5, 4, 10))
     textures = np.clip(128 + 150 * smooth, 0, 255)
-    for name, place in places.items():
-        corner_of_a_room(place, textures).save(data / "images" / name)
-    with redirect_stdout(StringIO()) as said:
-        assert poses.poses(data) == 0
-    assert said.getvalue().count("100%") == 3  # all bars
-    return data
+    places = {}
+    for n, a in enumerate(np.linspace(0.35, 1.25, 12)):
+        place = places[f"{n:02d}.png"] = np.array([3 * np.cos(a), 3 * np.sin(a), 1.2 + 0.1 * (n % 3)])
+        corner_of_a_room(place, textures).save(folder / f"{n:02d}.png")
+    return places
 
 
-def test_cameras_are_where_they_were(places, found):
-    model = pycolmap.Reconstruction(str(found / "sparse" / "0"))
+def test_cameras_are_where_they_were(tmp_path, capsys):
+    places = write_photos(tmp_path / "images")
+    assert poses.poses(tmp_path) == 0
+    assert capsys.readouterr().out.count("100%") == 3  # all bars
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     images = [model.image(i) for i in model.reg_image_ids()]
     assert len(images) == len(places)
     seen = np.array([image.projection_center() for image in images])
@@ -76,12 +64,12 @@ def test_cameras_are_where_they_were(places, found):
     assert np.linalg.norm(moved - true, axis=1).max() < 0.03
     (camera,) = model.cameras.values()  # no photo tells its focal length
     assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.03)
-    outputs = parser(found).get_dataparser_outputs("train")  # it can be trained on
+    outputs = parser(tmp_path).get_dataparser_outputs("train")  # it can be trained on
     assert len(outputs.image_filenames) == 10
     assert len(outputs.metadata["points3D_xyz"]) > 100
-    assert sorted(path.name for path in found.iterdir()) == ["images", "sparse"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "sparse"]
     with pytest.raises(UserError, match="exists already"):
-        poses.poses(found)
+        poses.poses(tmp_path)
 
 
 @pytest.fixture

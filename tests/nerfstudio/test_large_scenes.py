@@ -3,28 +3,11 @@
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.nerfstudio.model import AbcdModel
-
-CLOSE = 5e-4
-"""Drawing stops where 1e-4 of the light is left, and a node knows nothing of the others."""
-
-
-@pytest.fixture
-def drawn(monkeypatch) -> list[int]:
-    """How many Gaussians each drawing was given."""
-    counts, draw = [], TorchRasterizer.draw
-
-    def watched(self, gaussians, *args, **options):
-        counts.append(len(gaussians))
-        return draw(self, gaussians, *args, **options)
-
-    monkeypatch.setattr(TorchRasterizer, "draw", watched)
-    return counts
 
 
 def pictures(pipeline) -> list[dict]:
@@ -33,7 +16,14 @@ def pictures(pipeline) -> list[dict]:
     return [pipeline.model.get_outputs_for_camera(camera) for camera, _ in loader]
 
 
-def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
+def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch):
+    drawn, draw = [], TorchRasterizer.draw
+
+    def watched(self, gaussians, *args, **options):
+        drawn.append(len(gaussians))
+        return draw(self, gaussians, *args, **options)
+
+    monkeypatch.setattr(TorchRasterizer, "draw", watched)
     _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
     expected, count = pictures(pipeline), len(pipeline.model.means)
     assert set(drawn) == {count}
@@ -43,8 +33,8 @@ def test_a_checkpoint_is_drawn_by_nodes(trained, monkeypatch, drawn):
     found = pictures(pipeline)
     assert len(found) == len(expected) > 0
     for one, other in zip(found, expected, strict=True):
-        for name in ("rgb", "accumulation"):
-            assert float((one[name] - other[name]).abs().max()) < CLOSE, name
+        for name in ("rgb", "accumulation"):  # drawing stops where 1e-4 of the light is left
+            assert float((one[name] - other[name]).abs().max()) < 5e-4, name
         seen = other["accumulation"][..., 0] > 0.1
         torch.testing.assert_close(one["depth"][seen], other["depth"][seen], rtol=1e-2, atol=1e-2)
     assert max(drawn) < count

@@ -30,11 +30,7 @@ from abcd_ns.run.begin import grid_counts
 from tests.nerfstudio.forks import forget, in_a_fork
 from tests.nerfstudio.test_training import set_option
 
-METHODS = {
-    found.config.method_name: found.config
-    for found in vars(methods).values()
-    if isinstance(found, methods.MethodSpecification)
-}
+OURS = methods.abcd.config
 
 
 def parsed(*words: str, method: str = "abcd"):
@@ -73,7 +69,7 @@ def test_the_help_has_at_most_forty_flags(help_text):
 def test_what_has_no_effect_is_not_in_the_help(help_text):
     shown = {word.replace("-", "_") for word in re.findall(r"--([\w.-]+)", help_text)}
     assert {word for word in shown if refused(word)} == {"pipeline.model.camera_optimizer.mode"}  # taken
-    refuse_flags(sorted(f"--{word}" for word in shown), METHODS["abcd"])
+    refuse_flags(sorted(f"--{word}" for word in shown), OURS)
 
 
 def test_the_reference_has_every_option_of_ours_and_none_that_is_not():
@@ -81,7 +77,7 @@ def test_the_reference_has_every_option_of_ours_and_none_that_is_not():
     section = page[page.index("## Options") : page.index("## Splatfacto's options")]
     rows = re.findall(r"^\| (`[^|]*`) \|", section, re.MULTILINE)
     written = {name.replace("-", "_") for row in rows for name in re.findall(r"`([\w.-]+)`", row)}
-    known = set(flat_options(METHODS["abcd"]))
+    known = set(flat_options(OURS))
     written = {name if name in known else f"pipeline.{name}" for name in written}
     ours = {name for name in known if name.startswith("pipeline.")}
     not_set = ("data", "dataparser.data", "dataparser.as_stored", "data_format")
@@ -109,7 +105,7 @@ def test_the_reference_has_every_option_of_ours_and_none_that_is_not():
 )
 def test_a_flag_that_is_none_here_is_refused_in_one_line_with_the_nearest_name_or_the_reason(word, says):
     with pytest.raises(UserError) as refused:
-        refuse_flags(["--data", "x", word, "1"], METHODS["abcd"])
+        refuse_flags(["--data", "x", word, "1"], OURS)
     assert says in str(refused.value)
     assert word.partition("=")[0].replace("_", "-") in str(refused.value)
     assert "\n" not in str(refused.value)
@@ -131,7 +127,7 @@ def test_the_same_options_of_splatfacto_are_taken_and_the_recipe_is_the_methods(
     assert training.antialiased
     assert pipeline.model.rasterize_mode == "antialiased"
     assert pipeline.model.color_corrected_metrics  # held-out photos have a light of their own, too
-    assert training.recipe == METHODS["abcd-paper"].pipeline.training.recipe
+    assert training.recipe == methods.abcd_paper.config.pipeline.training.recipe
 
 
 BELOW_0 = ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb")
@@ -178,7 +174,7 @@ OF_TRAINING = ("batch", "point_pixels", "commit_seconds", "density.min_contribut
     ],
 )
 def test_what_has_no_effect_or_cannot_be_is_refused_from_files_too(way, value, says):
-    config = copy.deepcopy(METHODS["abcd"])
+    config = copy.deepcopy(OURS)
     check_options(config)
     set_option(config, way, value)
     with pytest.raises(UserError) as refused:
@@ -199,7 +195,7 @@ def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, 
 
 def test_any_reader_of_nerfstudios_is_named_as_with_splatfacto(capsys):
     words = ("--data", "x", "colmap", "--colmap-path", "sparse/0", "--downscale-factor", "2")
-    refuse_flags(words, METHODS["abcd"])
+    refuse_flags(words, OURS)
     ours, theirs = (parsed(*words, method=method) for method in ("abcd", "splatfacto"))
     parser = ours.pipeline.datamanager.dataparser
     assert parser == theirs.pipeline.datamanager.dataparser
@@ -226,7 +222,7 @@ def test_a_run_is_named_by_its_folder_however_that_is_given(given, tmp_path, mon
     (folder / "images").mkdir(parents=True)
     (folder / "transforms.json").touch()
     monkeypatch.chdir(folder / "images" if given == ".." else folder)
-    config = copy.deepcopy(methods.abcd.config)
+    config = copy.deepcopy(OURS)
     config.pipeline.datamanager.data, config.timestamp = Path(given), "now"
     assert config.get_base_dir() == Path("outputs/a/abcd/now")
 

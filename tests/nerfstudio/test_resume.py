@@ -60,13 +60,12 @@ def refusal(said_at_exit) -> Callable[..., str]:
 
 
 def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(data, trained, tmp_path):
-    killed_at = STEPS_PER_SAVE
-    options = {"kill_at_step": killed_at, "commit_seconds": 0.0}
+    options = {"kill_at_step": STEPS_PER_SAVE, "commit_seconds": 0.0}
     assert Trainings().finish(data, tmp_path / "killed", **options) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")
     assert not list(killed.rglob("*.ckpt"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=killed / "nerfstudio_models"))
-    assert 0 < resumed.resumed_from.step <= killed_at
+    assert 0 < resumed.resumed_from.step <= STEPS_PER_SAVE
     assert_same(resumed.base_dir, trained.base_dir)
 
 
@@ -124,7 +123,6 @@ def saved(folder: Path) -> list[int]:
 def test_a_signal_commits_and_says_how_to_go_on(
     data, trained, tmp_path, monkeypatch, said_at_exit, number, event
 ):
-    config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
     seen = count(1)
 
@@ -132,7 +130,7 @@ def test_a_signal_commits_and_says_how_to_go_on(
         if isinstance(happened, event) and next(seen) == 17:
             signal.raise_signal(number)
 
-    said = said_at_exit(run, config, listener=interrupt, code=128 + number)
+    said = said_at_exit(run, configure(data, tmp_path / "signal"), listener=interrupt, code=128 + number)
     assert f"Stopped by {number.name} after step" in said
     assert "nothing is lost" in said
     folder = run_folder(tmp_path / "signal")
@@ -146,7 +144,6 @@ def test_a_signal_commits_and_says_how_to_go_on(
 
 
 def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, monkeypatch, said_at_exit):
-    config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
 
@@ -156,7 +153,7 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, monkeypatch, sai
             signal.raise_signal(signal.SIGINT)
 
     try:
-        said = said_at_exit(run, config, listener=interrupt, code=130)
+        said = said_at_exit(run, configure(data, tmp_path / "signal"), listener=interrupt, code=130)
     finally:
         signal.signal(signal.SIGINT, before)
     assert "Stopped at once" in said

@@ -1,20 +1,12 @@
 """A signal ends a run between two steps, and the line that says how to go on is one that can be typed."""
 
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from abcd_ns.nerfstudio.run.stopping import StopSignals, command_to_resume, next_steps
-
-
-@pytest.fixture(autouse=True)
-def python_handles_interrupts():
-    """Also where the tests run in the background of a shell, which has them ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def test_handlers_are_put_back():
@@ -56,13 +48,9 @@ def test_what_is_next_are_commands_about_the_run():
 
 
 def test_in_another_thread_signals_stay_as_they_are():
-    before, seen = signal.getsignal(signal.SIGTERM), []
-
-    def enter() -> None:
+    def handler() -> object:
         with StopSignals():
-            seen.append(signal.getsignal(signal.SIGTERM))
+            return signal.getsignal(signal.SIGTERM)
 
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert seen == [before]
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(handler).result() == signal.getsignal(signal.SIGTERM)

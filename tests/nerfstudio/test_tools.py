@@ -91,9 +91,8 @@ def test_a_crop_box_leaves_what_is_in_it_on_its_own_background(rendered):
     crop = {"crop_bg_color": {"r": 255, "g": 0, "b": 255}, "crop_center": [9.0, 9.0, 9.0]}
     nothing = rendered(["rgb"], crop={**crop, "crop_scale": [0.1, 0.1, 0.1]})["00001.png"]
     assert (nothing == [255, 0, 255]).all()
-    wide = {**crop, "crop_scale": [99.0, 99.0, 99.0]}
-    viewer = dict(zip("rgb", (38, 42, 55), strict=True))
-    everything = rendered(["rgb"], crop={**wide, "crop_bg_color": viewer})["00001.png"]
+    wide = {"crop_scale": [99.0, 99.0, 99.0], "crop_bg_color": {"r": 38, "g": 42, "b": 55}}
+    everything = rendered(["rgb"], crop={**crop, **wide})["00001.png"]
     assert np.abs(everything - whole).max() <= 1
 
 
@@ -106,12 +105,8 @@ def test_pictures_without_background_have_alpha(rendered):
 
 
 def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
-    render.DatasetRender(
-        load_config=trained.base_dir / "config.yml",
-        output_path=tmp_path,
-        image_format="png",
-        split="train+test",
-    ).main()
+    options = {"image_format": "png", "split": "train+test"}
+    render.DatasetRender(load_config=trained.base_dir / "config.yml", output_path=tmp_path, **options).main()
     found = pictures(tmp_path)
     kinds = ("gt-rgb", "rgb", "depth", "accumulation", "background", "normals", "depth_median")
     assert len(found) == len(kinds) * VIEWS

@@ -177,14 +177,13 @@ def test_what_the_viewer_shows_changes_no_evaluation(watched):
     assert bool((before == after).all())
 
 
-@pytest.fixture
-def finished(watched, monkeypatch):
-    """ns-viewer on the run, up to where it would wait for ever: (config it was given, its viewer)."""
+def test_ns_viewer_stays_on_this_machine_and_shows_blocks(watched, monkeypatch, request):
     seen = []
 
     class Seen(Viewer):
         def __init__(self, config, *args, **kwargs) -> None:
             super().__init__(config, *args, **kwargs)
+            request.addfinalizer(self.viser_server.stop)
             seen.extend((config, self))
 
     monkeypatch.setattr(run_viewer, "ViewerState", Seen)
@@ -192,13 +191,8 @@ def finished(watched, monkeypatch):
     config = watched.trainer.base_dir / "config.yml"
     monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", str(config)])
     with pytest.raises(KeyboardInterrupt):
-        run_viewer.RunViewer(load_config=config).main()
-    yield tuple(seen)
-    seen[1].viser_server.stop()
-
-
-def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
-    config, viewer = finished
+        run_viewer.RunViewer(load_config=config).main()  # up to where it would wait for ever
+    config, viewer = seen
     assert ViewerConfig().websocket_host == "0.0.0.0"  # ns-viewer's own default
     assert config.websocket_host == "127.0.0.1"
     port = viewer.viser_server.get_port()
@@ -250,11 +244,8 @@ def test_a_viewer_that_fails_does_not_end_the_run(data, tmp_path, monkeypatch, c
 
 def test_a_viewers_background_counts_only_where_the_run_leaves_it_open(watched, monkeypatch):
     model, color = watched.trainer.pipeline.model, torch.tensor([0.1, 0.9, 0.2])
-    before = model.background_color
-    monkeypatch.setattr(model.config, "background_color", "white")
-    model.set_background(color)
-    assert model.background_color is before
-    monkeypatch.setattr(model.config, "background_color", "random")
-    model.set_background(color)
-    assert model.background_color is color
-    model.set_background(before)
+    monkeypatch.setattr(model, "background_color", model.background_color)  # so that it is put back
+    for option, taken in (("white", False), ("random", True)):
+        monkeypatch.setattr(model.config, "background_color", option)
+        model.set_background(color)
+        assert (model.background_color is color) == taken
