@@ -143,19 +143,16 @@ def test_photo_that_changed_since_the_check_is_named(sources, ahead):
 # Alpha
 
 
-def with_alpha(image: np.ndarray) -> np.ndarray:
-    """Two thirds transparent, with soft edges, and magenta below."""
-    alpha = np.random.default_rng(9).integers(-300, 320, (*image.shape[:2], 1)).clip(0, 255).astype(np.uint8)
-    return np.concatenate([np.where(alpha == 0, [255, 0, 255], image).astype(np.uint8), alpha], axis=2)
-
-
 @pytest.mark.parametrize("lens", [None, "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("divide", [1, 2, 3])
 def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp_path, lens, divide):
-    size, image = (240, 180), with_alpha(noise(0, size=(240, 180)))
-    reduced = (240 // divide, 180 // divide)
+    """Two thirds of the pixels are transparent, with soft edges, and magenta below."""
+    size, reduced = (240, 180), (240 // divide, 180 // divide)
     flat = None if lens is None else undistortion(lens_pair(lens, *reduced)[0])
-    on_black = np.rint(image[..., :3] * (image[..., 3:] / 255.0)).astype(np.uint8)
+    alpha = np.random.default_rng(9).integers(-300, 320, (180, 240, 1)).clip(0, 255).astype(np.uint8)
+    color = np.where(alpha == 0, [255, 0, 255], noise(0, size=size)).astype(np.uint8)
+    on_black = np.rint(color * (alpha / 255.0)).astype(np.uint8)
+    image = np.concatenate([color, alpha], axis=2)
     paths = saved(tmp_path / "cut.png", image), saved(tmp_path / "black.png", on_black)
     photos = Photos([PhotoSource(path, size, reduced, flat) for path in paths])
     cut, black = (photos.image(row).numpy().astype(float) for row in range(2))
