@@ -10,7 +10,6 @@ from abcd_ns.lab.job import METHODS
 from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import check_options, trainer_config
 
-CONFIGS = own_configs(trains=False)
 TILES = {"data": None, "steps": None, "tiles": (2, 4)}
 
 
@@ -132,7 +131,7 @@ def test_changes_that_cannot_be_trained_are_refused(tmp_path, vary, message):
         check_options(make_plan(options(tmp_path, vary=(vary,))).jobs[1])
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", own_configs(trains=False), ids=lambda path: path.stem)
 def test_the_examples_make_plans(path, tmp_path):
     plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))
     assert {job.method for job in plan.jobs} <= set(METHODS)
