@@ -52,8 +52,8 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
 def test_every_record_is_shown(tmp_path, capsys):
     memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
     joint = "splatfacto", "abcd-monolithic"
-    arms = [made_up_arm("default", None, {0: 20.0 + k}, method, **memory) for k, method in enumerate(joint)]
-    arms += [made_up_arm(f"blocks={n}", None, {0: 22.0 + n}, **memory) for n in (1, 8)]
+    arms = [made_up_arm("default", {0: 20.0 + k}, method, **memory) for k, method in enumerate(joint)]
+    arms += [made_up_arm(f"blocks={n}", {0: 22.0 + n}, **memory) for n in (1, 8)]
     found = {"results": asdict(made_up("GPU comparison", *arms))}
     show([WHOLE, WHOLE | {"part": "compare", "found": found}], tmp_path, Console())
     names = {path.name for path in tmp_path.iterdir()}

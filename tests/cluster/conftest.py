@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import pytest
 
@@ -13,7 +12,6 @@ from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -65,12 +63,8 @@ def setup_of(run: TrainingRun) -> RunSetup:
 def in_process(
     run: TrainingRun, photos: Photos, count: int, kind: Callable = InProcessWorkers, **setup
 ) -> InProcessWorkers:
-    worker = VisitWorker(replace(setup_of(run), **setup), TorchRasterizer(), partial(target_of, photos))
+    worker = VisitWorker(replace(setup_of(run), **setup), TorchRasterizer(), photos.target)
     return kind(worker, count)
-
-
-def target_of(photos: Photos, sample: Sample) -> Target:
-    return photos(sample.view.index, sample.crop), None
 
 
 def make_run(folder, views, workers_of=None, lag: int | None = None, target=None, **options):

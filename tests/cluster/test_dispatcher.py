@@ -16,7 +16,7 @@ from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.cluster.conftest import GROWING, InProcessWorkers, in_process, target_of
+from tests.cluster.conftest import GROWING, InProcessWorkers, in_process
 from tests.reference.scenes import STILL, equal, listen, stop, whole_scene
 
 
@@ -128,19 +128,14 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos):
     """Gaussians that come to wait for a block while it is out are there when it is home, though it be cut."""
     run = make(workers=3, lag=5, density=STILL, steps=90, block_limit=24)
     total, generator = run.count(), torch.Generator().manual_seed(0)
-    inner = run.workers.wait
+    wait = run.workers.wait
 
-    def wait(seconds):
-        reports = inner(seconds)
-        for report in reports:
-            state = report.outcome.state
-            noise = 0.3 * torch.randn(state.gaussians.means.shape, generator=generator)
-            moved = replace(state.gaussians, means=state.gaussians.means + noise)
-            outcome = replace(report.outcome, state=replace(state, gaussians=moved))
-            reports = [Finished(report.assignment, outcome)]
-        return reports
+    def elsewhere(outcome):
+        gaussians = outcome.state.gaussians
+        means = gaussians.means + 0.3 * torch.randn(gaussians.means.shape, generator=generator)
+        return replace(outcome, state=replace(outcome.state, gaussians=replace(gaussians, means=means)))
 
-    run.workers.wait = wait
+    run.workers.wait = lambda seconds: [Finished(n, elsewhere(outcome)) for n, outcome in wait(seconds)]
     moved = 0
     while not run.finished:
         train_step(run, photos)
@@ -226,7 +221,7 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
         return run
 
     monkeypatch.setattr(VisitWorker, "_run_of", watched)
-    run = make(workers=2, poses="SO3xR3", target=partial(target_of, photos), **WARM_UP)
+    run = make(workers=2, poses="SO3xR3", target=photos.target, **WARM_UP)
     given = {index: view.viewmat for index, view in run.views.items()}
     while not run.trains_elsewhere:
         train(run, photos, steps=1)

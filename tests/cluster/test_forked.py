@@ -18,7 +18,7 @@ from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.errors import UserError
-from tests.cluster.conftest import GROWING, make_run, setup_of, target_of
+from tests.cluster.conftest import GROWING, make_run, setup_of
 from tests.reference.scenes import equal, listen, whole_scene
 from tests.reference.store_helpers import wait_until
 
@@ -32,7 +32,7 @@ def make(tmp_path, views, photos):
     def made(target=lambda _: None, rasterizer=TorchRasterizer()):  # noqa: B008
         def watched(sample):
             target(sample)
-            return target_of(photos, sample)
+            return photos.target(sample)
 
         def workers_of(run):
             return ForkedWorkers(2, VisitWorker(setup_of(run), rasterizer, watched))

@@ -22,7 +22,7 @@ from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.errors import UserError
-from tests.cluster.conftest import GROWING, make_run, target_of
+from tests.cluster.conftest import GROWING, make_run
 from tests.reference.scenes import equal, listen, whole_scene
 
 os.environ.update(RAY_worker_niceness="0")  # niced, as Ray has it, they starve beside the other tests
@@ -58,7 +58,7 @@ def make_worker(setup, photos, seconds: float = 0.0, traps: Path | None = None) 
             with suppress(FileNotFoundError):
                 (traps / name).unlink()
                 raise error
-        return target_of(photos, sample)
+        return photos.target(sample)
 
     return VisitWorker(setup, TorchRasterizer(), target)
 

@@ -29,15 +29,13 @@ from tests.data.test_layouts import write_blender
 PINHOLE = {"fx": 40.0, "fy": 40.0, "cx": 16.0, "cy": 12.0, "width": 32, "height": 24}
 
 
-def colmap(data: Path, **options) -> ColmapDataParserConfig:
-    given = {"downscale_factor": 1, "colmap_path": Path("sparse/0"), **options}
-    return ColmapDataParserConfig(data=data, **given)
+def colmap(data: Path, factor: int = 1) -> ColmapDataParserConfig:
+    return ColmapDataParserConfig(data=data, downscale_factor=factor, colmap_path=Path("sparse/0"))
 
 
 def outputs_of(path: Path, **camera) -> DataparserOutputs:
     """Of one photo."""
-    given = {**PINHOLE, **camera}
-    cameras = Cameras(camera_to_worlds=torch.eye(4)[None, :3], **given)
+    cameras = Cameras(camera_to_worlds=torch.eye(4)[None, :3], **{**PINHOLE, **camera})
     return DataparserOutputs(image_filenames=[path], cameras=cameras)
 
 
@@ -160,7 +158,7 @@ def test_a_capture_is_measured(scene):
     assert inspect(colmap(scene)) == Inspected(8, 2, SIZES[0], 20, 1)
     write_photos(scene / "images_2", divide=2)
     half = Inspected(8, 2, (SIZES[0][0] // 2, SIZES[0][1] // 2), 20, 2)
-    assert inspect(colmap(scene, downscale_factor=2)) == half
+    assert inspect(colmap(scene, factor=2)) == half
     said = "8 views to train on, 2 held out; photos of up to {} x {} px, divided by 2."
     assert half.in_words() == said.format(*half.size)
     without_points = BlenderDataParserConfig(data=write_blender(scene / "lego"))

@@ -143,19 +143,16 @@ def test_photo_that_changed_since_the_check_is_named(sources, ahead):
 # Alpha
 
 
-def with_alpha(image: np.ndarray) -> np.ndarray:
-    """Two thirds transparent, with soft edges, and magenta below."""
-    alpha = np.random.default_rng(9).integers(-300, 320, (*image.shape[:2], 1)).clip(0, 255).astype(np.uint8)
-    return np.concatenate([np.where(alpha == 0, [255, 0, 255], image).astype(np.uint8), alpha], axis=2)
-
-
 @pytest.mark.parametrize("lens", [None, "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("divide", [1, 2, 3])
 def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp_path, lens, divide):
-    size, image = (240, 180), with_alpha(noise(0, size=(240, 180)))
-    reduced = (240 // divide, 180 // divide)
+    """Two thirds of the pixels are transparent, with soft edges, and magenta below."""
+    size, reduced = (240, 180), (240 // divide, 180 // divide)
     flat = None if lens is None else undistortion(lens_pair(lens, *reduced)[0])
-    on_black = np.rint(image[..., :3] * (image[..., 3:] / 255.0)).astype(np.uint8)
+    alpha = np.random.default_rng(9).integers(-300, 320, (180, 240, 1)).clip(0, 255).astype(np.uint8)
+    color = np.where(alpha == 0, [255, 0, 255], noise(0, size=size)).astype(np.uint8)
+    on_black = np.rint(color * (alpha / 255.0)).astype(np.uint8)
+    image = np.concatenate([color, alpha], axis=2)
     paths = saved(tmp_path / "cut.png", image), saved(tmp_path / "black.png", on_black)
     photos = Photos([PhotoSource(path, size, reduced, flat) for path in paths])
     cut, black = (photos.image(row).numpy().astype(float) for row in range(2))
@@ -266,12 +263,6 @@ def lens_pair(kind: str, width: int, height: int) -> tuple[Lens, pycolmap.Camera
     return Lens(width, height, focals[0], focals[-1], *center, values, fisheye), camera
 
 
-def pixel_rays(lens: Lens) -> np.ndarray:
-    """(x, y) of the rays (x, y, 1) through all pixel centres, float64 [height * width, 2]."""
-    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    return np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy], axis=-1).reshape(-1, 2)
-
-
 @pytest.mark.parametrize("kind", LENSES)
 def test_undistorted_pixels_come_from_where_colmap_sees_them(tmp_path, kind):
     """The photo's red and green say the column and row, so each result pixel says where it came from. Blue is
@@ -279,14 +270,16 @@ def test_undistorted_pixels_come_from_where_colmap_sees_them(tmp_path, kind):
     width, height = 240, 180
     lens, camera = lens_pair(kind, width, height)
     flat = undistortion(lens)
+    pinhole = flat.pinhole
     rows, columns = np.mgrid[:height, :width].astype(np.uint8)
     photo = saved(tmp_path / "p.png", np.stack([columns, rows, np.full_like(rows, 255)], axis=-1))
     image = Photos([PhotoSource(photo, lens.size, lens.size, flat)]).image(0).numpy()
-    assert image.shape == (flat.pinhole.height, flat.pinhole.width, 3)
+    assert image.shape == (pinhole.height, pinhole.width, 3)
     assert (image[..., 2] == 255).mean() > 0.98
-    assert flat.pinhole.width > 0.9 * lens.width
-    assert not flat.pinhole.distorted
-    rays = pixel_rays(flat.pinhole)
+    assert pinhole.width > 0.9 * lens.width
+    assert not pinhole.distorted
+    y, x = np.mgrid[: pinhole.height, : pinhole.width] + 0.5
+    rays = np.stack([(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy], axis=-1).reshape(-1, 2)
     expected = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
     assert np.abs(distort(lens, rays) - expected).max() < 1e-6
     # The photo ends at its outermost pixel centres; OpenCV's cropping is good to a pixel.

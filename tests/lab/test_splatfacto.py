@@ -6,16 +6,15 @@ from nerfstudio.data.scene_box import SceneBox
 
 from abcd_ns.lab.runs.splatfacto import Splatfacto, scaled
 
-BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-
 
 def test_it_fetches_no_weights(monkeypatch):
     """That it trains and draws on a CPU is seen in compare/test_real.py."""
     for name in ("download_url_to_file", "load_state_dict_from_url"):
         monkeypatch.setattr(f"torch.hub.{name}", None)
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     points = torch.randn(200, 3), 255 * torch.rand(200, 3)
     config = method_configs["splatfacto"].pipeline.model
-    assert Splatfacto(config, scene_box=BOX, num_train_data=1, seed_points=points).num_points == 200
+    assert Splatfacto(config, scene_box=box, num_train_data=1, seed_points=points).num_points == 200
 
 
 def test_all_its_schedules_are_scaled_together():

@@ -24,9 +24,22 @@ def watched_panel(browsers: int = 1) -> AbcdPanel:
     return panel
 
 
-def draws_meanwhile(panel: AbcdPanel, event) -> bool:
-    """Whether a thread that waits for the lock gets it while the training thread announces `event`."""
-    lock, waits, had_it = panel.viewer.train_lock, threading.Event(), threading.Event()
+@pytest.mark.parametrize(
+    ("browsers", "event", "seconds", "draws"),
+    [
+        (1, LayersDrawn(0, 1, 9), 0.0, True),
+        (1, Pruning(1, 9), 0.0, True),
+        (0, LayersDrawn(0, 1, 9), 0.0, False),  # to nobody
+        (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
+        (1, LayersDrawn(0, 1, 9), 1e6, False),  # once a second at most
+    ],
+)
+def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
+    """A thread that waits for it gets it while the training thread announces some events."""
+    monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
+    monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", seconds)
+    panel, waits, had_it = watched_panel(browsers), threading.Event(), threading.Event()
+    lock = panel.viewer.train_lock
 
     def draw() -> None:
         waits.set()
@@ -39,25 +52,8 @@ def draws_meanwhile(panel: AbcdPanel, event) -> bool:
         waits.wait()
         panel(event)
         assert lock.locked()
-        meanwhile = had_it.is_set()
+        assert had_it.is_set() == draws
     thread.join()
-    return meanwhile
-
-
-@pytest.mark.parametrize(
-    ("browsers", "event", "seconds", "draws"),
-    [
-        (1, LayersDrawn(0, 1, 9), 0.0, True),
-        (1, Pruning(1, 9), 0.0, True),
-        (0, LayersDrawn(0, 1, 9), 0.0, False),  # to nobody
-        (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
-        (1, LayersDrawn(0, 1, 9), 1e6, False),  # once a second at most
-    ],
-)
-def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
-    monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
-    monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", seconds)
-    assert draws_meanwhile(watched_panel(browsers), event) == draws
 
 
 def test_a_browser_that_was_open_before_the_panel_is_shown_the_scene_too():

@@ -22,10 +22,9 @@ VIEW = ring_of_views(3, dtype=torch.float64)[1]
 TREE = build_kd(GAUSSIANS.means, 6)
 
 
-def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, window_weight=0.0):
-    scene = scene or MemoryScene(tree, GAUSSIANS)
-    renderer = LayerRenderer(scene, DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
-    return BlockPictures(renderer, VIEW, SETTINGS, window_weight)
+def pictures(ownership="fragments", gaussians=GAUSSIANS):
+    scene = MemoryScene(TREE, gaussians)
+    return BlockPictures(LayerRenderer(scene, DRAW, ownership=ownership, pass_gaussians=0), VIEW, SETTINGS)
 
 
 def test_a_block_alone_is_its_own_gaussians():
@@ -60,12 +59,11 @@ def test_by_either_ownership_front_and_back_are_what_the_composite_is_made_of(ow
 
 
 def test_an_empty_block_shows_nothing():
-    owner = TREE.assign(GAUSSIANS.means)
-    scene = MemoryScene(TREE, GAUSSIANS[owner != 2])
-    nothing = pictures(scene=scene).draw(Show.BLOCK, 2)
+    made = pictures(gaussians=GAUSSIANS[TREE.assign(GAUSSIANS.means) != 2])
+    nothing = made.draw(Show.BLOCK, 2)
     assert float(nothing.transmittance.min()) == 1.0
     assert nothing.depth.shape == (VIEW.height, VIEW.width)
-    assert torch.isfinite(pictures(scene=scene).draw(Show.COMPOSITE, 2).color).all()
+    assert torch.isfinite(made.draw(Show.COMPOSITE, 2).color).all()
 
 
 def test_no_client_makes_a_picture_of_any_size():

@@ -38,13 +38,12 @@ class FakeWorker:
         folder.mkdir()
         (folder / "worker.py").write_text(WORKER)
         (folder / "run.json").write_text(json.dumps(asdict(made_up_run())))
-        self.behave()
+        self.behave({})
 
-    def behave(self, changed: dict[str, str | dict] | None = None, **by_method: str) -> None:
+    def behave(self, what: dict[str, str | dict]) -> None:
         """What to do, by what is changed or by method: "raises", "is killed", "is silent", or fields of the
         run that is made up."""
-        named = {name.replace("_", "-"): what for name, what in by_method.items()}
-        (self.folder / "behaviour.json").write_text(json.dumps({**named, **(changed or {})}))
+        (self.folder / "behaviour.json").write_text(json.dumps(what))
 
     def calls(self) -> list[str]:
         """Methods, and what was changed of them, that it was started for since the last call of this."""

@@ -43,9 +43,9 @@ def made_up(kind: str, *arms: Arm, **fields) -> Results:
     return dataclasses.replace(results, findings=findings_of(results))
 
 
-def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
+def made_up_arm(variant: str, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
     runs = (made_up_run(method, seed, psnr_merged=psnr, psnr=psnr, **fields) for seed, psnr in psnrs.items())
-    return Arm(method, variant, value, tuple(runs))
+    return Arm(method, variant, None, tuple(runs))
 
 
 def made_up_results(*runs: Run, **fields) -> Results:

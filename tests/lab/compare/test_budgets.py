@@ -17,17 +17,15 @@ JOINT_BYTES = 8_000_000
 
 @pytest.fixture
 def options(tmp_path) -> Options:
-    scene = tmp_path / "scene"
-    scene.mkdir()
     methods = ("abcd", "abcd-partition", "splatfacto-scaled")
     given = {"methods": methods, "steps": 10, "seeds": (0, 1), "budgets": ("1/4", "1/2")}
-    return Options(data=str(scene), out=str(tmp_path / "out"), **given)
+    return Options(data=str(tmp_path), out=str(tmp_path / "out"), **given)
 
 
 def test_every_method_of_abcds_and_joint_training_get_each_share(options, worker, tmp_path, drawn):
     """Joint training took so many bytes; the chart is of what the others took."""
     took = {"gaussian_bytes": JOINT_BYTES}
-    worker.behave(abcd_monolithic=took, splatfacto_scaled=took)
+    worker.behave({"abcd-monolithic": took, "splatfacto-scaled": took})
     plan = make_plan(options)
     assert "--budgets 1/4 1/2" in plan.command
     assert "--blocks" not in plan.command.split()

@@ -10,7 +10,6 @@ from abcd_ns.lab.job import METHODS
 from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import check_options, trainer_config
 
-CONFIGS = own_configs(trains=False)
 TILES = {"data": None, "steps": None, "tiles": (2, 4)}
 
 
@@ -80,10 +79,6 @@ def test_the_command_line_goes_before_the_file():
     assert Options().over(file) == file
 
 
-def names_of(plan) -> list[tuple[str, str]]:
-    return [(job.method, job.variant) for job in plan.jobs]
-
-
 def test_every_method_with_every_seed_block_count_and_change_has_a_folder_of_its_own(tmp_path):
     methods = ("splatfacto", "abcd", "abcd-monolithic")
     given = {"blocks": (4, 1), "seeds": (3, 1), "vary": ("training.batch=1",)}
@@ -92,7 +87,7 @@ def test_every_method_with_every_seed_block_count_and_change_has_a_folder_of_its
     once = [("abcd-monolithic", "default"), ("abcd-monolithic", batch)]
     once += [("abcd", f"blocks={n}{more}") for n in (1, 4) for more in ("", f" {batch}")]
     once += [("splatfacto", "default")]
-    assert names_of(plan) == 2 * once
+    assert [(job.method, job.variant) for job in plan.jobs] == 2 * once
     assert [job.seed for job in plan.jobs] == [3] * 7 + [1] * 7
     assert [trainer_config(job, tmp_path).pipeline.blocks for job in plan.jobs[:6]] == [1, 1, 1, 1, 4, 4]
     assert plan.jobs[2].folder(Path("out")) == Path("out/runs/abcd/blocks=1-seed-3")
@@ -108,8 +103,8 @@ def test_changes_are_arms_beside_the_method_as_it_is_and_one_block_is_one_block(
     blocks = [("default", 4), (vary[0], 4), (vary[1], 9), (vary[2], 27)]
     expected = [("abcd-monolithic", name, 1) for name in ("default", vary[0], "partition=grid")]
     expected += [("abcd", name, count) for name, count in blocks]
-    found = zip(names_of(plan), configs, strict=True)
-    assert [(*names, config.blocks) for names, config in found] == expected
+    found = zip(plan.jobs, configs, strict=True)
+    assert [(job.method, job.variant, config.blocks) for job, config in found] == expected
     assert configs[1].training.density.min_contribution == 0.5
     assert f"--vary {vary[0]} {vary[1]} '{vary[2]}'" in plan.command
 
@@ -136,7 +131,7 @@ def test_changes_that_cannot_be_trained_are_refused(tmp_path, vary, message):
         check_options(make_plan(options(tmp_path, vary=(vary,))).jobs[1])
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", own_configs(trains=False), ids=lambda path: path.stem)
 def test_the_examples_make_plans(path, tmp_path):
     plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))
     assert {job.method for job in plan.jobs} <= set(METHODS)

@@ -68,18 +68,18 @@ def test_table_has_a_column_per_method_and_a_row_per_known_measure():
 
 
 def test_changes_have_their_difference_to_the_method_as_it_is_seed_by_seed():
-    default = made_up_arm("default", None, {0: 20.0, 1: 24.0, 2: 9.0})
-    other = made_up_arm("training.batch=1", None, {0: 21.0, 1: 25.5})
+    default = made_up_arm("default", {0: 20.0, 1: 24.0, 2: 9.0})
+    other = made_up_arm("training.batch=1", {0: 21.0, 1: 25.5})
     results = made_up("comparison", default, other, seeds=(0, 1, 2))
     (differences,) = (row for row in rows(results) if row[0] == "difference (dB)")
     assert differences == ["difference (dB)", "-", "+1.25 ± 0.35"]
     assert any("seed by seed" in note for note in notes(results))
     assert not any(row[0] == "difference (dB)" for row in rows(made_up("comparison", default)))
     names = ("blocks=1", "blocks=1 training.batch=1", "blocks=8", "blocks=8 training.batch=1")
-    results = made_up("comparison", *(made_up_arm(name, None, {0: 20.0}) for name in names))
+    results = made_up("comparison", *(made_up_arm(name, {0: 20.0}) for name in names))
     bases = [base and base.variant for base in map(results.baseline, results.arms)]
     assert bases == [None, "blocks=1", None, "blocks=8"]
-    varied = [made_up_arm(name, None, {0: 20.0}) for name in ("default", "partition=grid blocks=27")]
+    varied = [made_up_arm(name, {0: 20.0}) for name in ("default", "partition=grid blocks=27")]
     assert made_up("comparison", *varied).baseline(varied[1]) is varied[0]
 
 
@@ -97,8 +97,8 @@ def test_the_worst_view_is_held_against_the_same_of_one_block():
 
 def test_a_method_with_several_arms_has_its_best_and_worst_and_the_fewest_gaussians_said():
     sizes = {"blocks=1": (25.0, 9000), "blocks=2": (24.9, 4000), "blocks=27": (24.4, 2000)}
-    arms = [made_up_arm(n, None, {0: psnr}, gaussians=count) for n, (psnr, count) in sizes.items()]
-    (finding,) = made_up("comparison", *arms, made_up_arm("default", None, {0: 9.0}, "splatfacto")).findings
+    arms = [made_up_arm(n, {0: psnr}, gaussians=count) for n, (psnr, count) in sizes.items()]
+    (finding,) = made_up("comparison", *arms, made_up_arm("default", {0: 9.0}, "splatfacto")).findings
     for part in (
         "Best: abcd, 1 block, 25.00 dB.",
         "Worst: abcd, 27 blocks, 24.40 dB.",
@@ -161,7 +161,7 @@ def test_within_budgets_pictures_are_of_the_smallest_beside_what_no_limit_gives(
     asked = {"abcd-monolithic": [(), ("gaussian_bytes=4194304",), ("gaussian_bytes=2097152",)]}
     asked["abcd"] = asked["abcd-monolithic"][1:]
     jobs = tuple(Job(m, 0, made_up_settings(), changes) for m, arms in asked.items() for changes in arms)
-    results = made_up("comparison", *(made_up_arm(j.variant, None, {0: 24.0}, j.method) for j in jobs))
+    results = made_up("comparison", *(made_up_arm(j.variant, {0: 24.0}, j.method) for j in jobs))
     found = shown(results, Plan("comparison", results.settings, Path("out"), jobs, "abcd"))
     assert [label for label, _, _ in found] == ["abcd-monolithic", "abcd-monolithic, 2 MiB", "abcd, 2 MiB"]
     assert len({folder for _, _, folder in found}) == 3

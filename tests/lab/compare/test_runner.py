@@ -24,10 +24,8 @@ from tests.lab.compare.records import MACHINE, read_results
 
 @pytest.fixture
 def plan(tmp_path) -> Plan:
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    out = tmp_path / "out"
-    return make_plan(Options(data=str(scene), out=str(out), steps=10, methods=("abcd-monolithic", "abcd")))
+    methods = ("abcd-monolithic", "abcd")
+    return make_plan(Options(data=str(tmp_path), out=str(tmp_path / "out"), steps=10, methods=methods))
 
 
 def run(plan: Plan, overwrite: bool = False) -> list[Run | Failure]:
@@ -78,13 +76,13 @@ def test_a_job_ends_with_a_comparison_that_is_killed(plan, tmp_path):
     ],
 )
 def test_a_failed_run_is_reported_and_the_others_go_on(plan, worker, behaviour, reason):
-    worker.behave(abcd_monolithic=behaviour)
+    worker.behave({"abcd-monolithic": behaviour})
     failure, finished = run(plan)
     assert isinstance(failure, Failure)
     assert (failure.method, failure.reason) == ("abcd-monolithic", reason)
     assert (plan.out / failure.log).read_text().startswith("starting")
     assert isinstance(finished, Run)
-    worker.behave()
+    worker.behave({})
     assert [type(outcome) for outcome in run(plan)] == [Run, Run]
 
 
