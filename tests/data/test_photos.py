@@ -263,6 +263,12 @@ def lens_pair(kind: str, width: int, height: int) -> tuple[Lens, pycolmap.Camera
     return Lens(width, height, focals[0], focals[-1], *center, values, fisheye), camera
 
 
+def pixel_rays(lens: Lens) -> np.ndarray:
+    """(x, y) of the rays (x, y, 1) through all pixel centres, float64 [height * width, 2]."""
+    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
+    return np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy], axis=-1).reshape(-1, 2)
+
+
 @pytest.mark.parametrize("kind", LENSES)
 def test_undistorted_pixels_come_from_where_colmap_sees_them(tmp_path, kind):
     """The photo's red and green say the column and row, so each result pixel says where it came from. Blue is
@@ -270,16 +276,14 @@ def test_undistorted_pixels_come_from_where_colmap_sees_them(tmp_path, kind):
     width, height = 240, 180
     lens, camera = lens_pair(kind, width, height)
     flat = undistortion(lens)
-    pinhole = flat.pinhole
     rows, columns = np.mgrid[:height, :width].astype(np.uint8)
     photo = saved(tmp_path / "p.png", np.stack([columns, rows, np.full_like(rows, 255)], axis=-1))
     image = Photos([PhotoSource(photo, lens.size, lens.size, flat)]).image(0).numpy()
-    assert image.shape == (pinhole.height, pinhole.width, 3)
+    assert image.shape == (flat.pinhole.height, flat.pinhole.width, 3)
     assert (image[..., 2] == 255).mean() > 0.98
-    assert pinhole.width > 0.9 * lens.width
-    assert not pinhole.distorted
-    y, x = np.mgrid[: pinhole.height, : pinhole.width] + 0.5
-    rays = np.stack([(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy], axis=-1).reshape(-1, 2)
+    assert flat.pinhole.width > 0.9 * lens.width
+    assert not flat.pinhole.distorted
+    rays = pixel_rays(flat.pinhole)
     expected = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
     assert np.abs(distort(lens, rays) - expected).max() < 1e-6
     # The photo ends at its outermost pixel centres; OpenCV's cropping is good to a pixel.

@@ -16,6 +16,8 @@ from websockets.exceptions import InvalidStatus
 from abcd_ns.viewer import guard
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 
+SECRET = b"the canary sings"
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[viser.ViserServer]:
@@ -49,14 +51,29 @@ def answers(server, browser):
     box.remove()
 
 
-def test_no_path_leads_to_a_file_outside(server, tmp_path):
-    canary, root = tmp_path / "canary.txt", "/.." * 20
-    canary.write_bytes(b"the canary sings")
-    ups = root, f"/assets{root}", root.replace(".", "%2e"), root.replace("/", "%2f"), f"/{root}", "/", "/%00"
-    for up in ups:
+@pytest.fixture
+def canary(tmp_path: Path) -> Path:
+    path = tmp_path / "canary.txt"
+    path.write_bytes(SECRET)
+    return path
+
+
+UP = "/.." * 20
+"""From any folder to the root."""
+
+
+def test_no_path_leads_to_a_file_outside(server, canary):
+    for up in (UP, f"/assets{UP}", UP.replace(".", "%2e"), UP.replace("/", "%2f"), f"/{UP}", "/", "/%00"):
         answer = ask(server, f"{up}{canary}")
-        assert canary.read_bytes() not in answer, up
+        assert SECRET not in answer, up
         assert status(answer) in (HTTPStatus.FORBIDDEN, HTTPStatus.BAD_REQUEST), up
+
+
+def test_without_the_guard_the_canary_sings(canary, monkeypatch):
+    monkeypatch.setattr(_infra, "websockets", _infra.websockets._original)
+    bare = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    assert SECRET in ask(bare, f"{UP}{canary}")
+    bare.stop()
 
 
 def test_the_page_is_served_and_told_to_stay_at_home(server):
