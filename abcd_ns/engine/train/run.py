@@ -124,7 +124,7 @@ class TrainingRun:
         grown = self.share >= config.density.refine_stop
         if not config.limits.late_harmonics or (grown and self.among_others):
             return config.sh_degree  # when its visit begins, a block is cut to have room for all
-        if grown:
+        if grown and self.blocks == 1:
             alone = self.count() if self.state.active is None else len(self.params["means"])
             found = degree_with_room(config, alone)
         return max(self.state.sh_degree, found)
