@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.peers.independent import (
@@ -152,3 +153,11 @@ def test_a_block_keeps_to_what_a_device_holds_though_its_overlap_is_more(indepen
         train_step(coordinator, photos)
         assert len(coordinator.params["means"]) <= 35
     assert any(event.gaussians == 35 for event in began)
+
+
+def test_where_harmonics_come_late_a_block_does_without(independent, photos, start):
+    start = start.of_degree(0).of_degree(start.sh_degree)
+    coordinator = independent(start=start, steps=40, density=STILL, sole_limit=1000, late_harmonics=2)
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        assert coordinator.state.active is None or active_gaussians(coordinator.params).sh_degree == 0
