@@ -8,14 +8,13 @@ from collections.abc import Callable, Iterable, Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import BlockSplit, EpochEnded, VisitEnded
+from abcd_ns.engine.events import EpochEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.influence import Influence, influence
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.commit import commit
 from abcd_ns.engine.store.special_blocks import ACTIVE, BlockName
-from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -141,9 +140,7 @@ class Coordinator(Trainer):
         """Persist what a visit changed: the `updates` made of `state`, its block as trained. Cut blocks that
         have outgrown their limit, and tell listeners."""
         run = self.run
-        tree, parts, parents = cut_full(self.scene, updates, run.state, run.limits)
-        for new, parent in parents.items():
-            run.announce(BlockSplit(parent, new))
+        tree, parts = run.cut(updates)
         if active.is_joint and tree.num_blocks > 1:
             run.state.influence = self._influence(state, tree, run.views)
         run.persist(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)

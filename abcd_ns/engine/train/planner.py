@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from statistics import median_high
 
-from abcd_ns.engine.events import BlockSplit
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
@@ -13,7 +12,6 @@ from abcd_ns.engine.space.visibility import Frusta, Optics
 from abcd_ns.engine.store.commit import pending_without, with_pending
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train import schedule
-from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, BlockHealth, VisitKind
 from abcd_ns.engine.train.step.batch import Batch, Pictures
@@ -170,13 +168,11 @@ class Planner(Visits):
         run, scene = self._run, self._scene
         if not run.limits.is_full(scene.count(block), scene.tree.num_blocks):
             return False
-        large = {block: with_pending(scene, block), **pending_without(scene, block)}
-        tree, parts, parents = cut_full(scene, large, run.state, run.limits)
-        for new, parent in parents.items():
-            run.announce(BlockSplit(parent, new))
-        if parents:
-            run.persist(tree, parts, self._config.commit_seconds)
-        return bool(parents)
+        tree, parts = run.cut({block: with_pending(scene, block), **pending_without(scene, block)})
+        if tree is scene.tree:  # all of it coincides
+            return False
+        run.persist(tree, parts, self._config.commit_seconds)
+        return True
 
     def _steps_of(self, plan: schedule.VisitPlan) -> int:
         """Of a visit in the queue: as many as planned, or, in the last epoch, its share of what is left. An

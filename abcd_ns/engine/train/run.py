@@ -5,7 +5,7 @@ from statistics import median
 
 import torch
 
-from abcd_ns.engine.events import Announcer
+from abcd_ns.engine.events import Announcer, BlockSplit
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer
@@ -16,6 +16,7 @@ from abcd_ns.engine.train.capture.light import HeldLight, Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.health import Health
 from abcd_ns.engine.train.memory import degree_with_room, limits_at
 from abcd_ns.engine.train.recipe import Limits
@@ -149,6 +150,14 @@ class TrainingRun:
     def count(self) -> int:
         """Gaussians in the whole scene, the active block included."""
         return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
+
+    def cut(self, updates: dict[BlockName, BlockState]) -> tuple[BlockTree, dict[BlockName, BlockState]]:
+        """Cut blocks that have outgrown their limit, before they are persisted, and tell listeners. Gives the
+        tree and everything to persist."""
+        tree, parts, parents = cut_full(self.scene, updates, self.state, self.limits)
+        for new, parent in parents.items():
+            self.announce(BlockSplit(parent, new))
+        return tree, parts
 
     def persist(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
         """Persist blocks and the run's state, as one snapshot; on disk within so many seconds."""

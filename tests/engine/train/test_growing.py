@@ -146,9 +146,9 @@ def test_it_is_the_error_that_halves_of_two_colours_remove(axis):
     truth = two_colours(gaussians, axis, 0.3)
     gain, along = worth({WORTH: judged(gaussians, truth)}, len(VIEWS), 0.0)
     assert int(along) == axis
-    halves, removed = two_colours(gaussians, axis, 0.0), 0.0
+    parts, removed = two_colours(gaussians, axis, 0.0), 0.0
     for view in VIEWS:
-        pictures = (DRAW(drawn, view, sh_degree=0).color for drawn in (truth, halves))
+        pictures = (DRAW(drawn, view, sh_degree=0).color for drawn in (truth, parts))
         removed += float((next(pictures) - next(pictures)).square().sum())
     assert 0.5 * removed < float(gain) < 1.5 * removed
 

@@ -48,8 +48,8 @@ class DensityConfig:
     """Limit for the whole scene. 0 is none. Of more points, a random choice starts."""
     min_contribution: float = 8.0
     """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
-    It rises from 0 until growth ends. Of n < 25 training views it is n / 25 of this. 0 turns all pruning by
-    contribution off, of floaters too, and the final pruning."""
+    It rises from 0 until growth ends, to half of this where memory cuts the scene. Of n < 25 training views
+    it is n / 25. 0 turns all pruning by contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
     """Split a Gaussian if that removes as much squared error as this many average pixels have.
     Both count in all views of its block. A refinement splits a tenth of the scene at most. In visits a
