@@ -29,12 +29,13 @@ def footprint(extent: Sequence[float], view: View, margin: int = 0) -> Crop | No
     image.
 
     Args:
-        extent: where that is: (left, top, right, bottom), px; see Rasterizer.extents.
+        extent: where that is: (left, top, right, bottom), px; see Rasterizer.extents. Nowhere where a side
+            is beyond its opposite.
         margin: grow by this many px (a loss that looks at neighbouring pixels needs it), before edges are
             aligned.
     """
     x0, y0, x1, y1 = extent
-    if x0 > x1:
+    if x0 > x1 or y0 > y1:
         return None
     x, width = _aligned_span(x0, x1, view.width, margin)
     y, height = _aligned_span(y0, y1, view.height, margin)

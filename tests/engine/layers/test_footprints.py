@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.footprints import CROP_MARGIN, extent_of_most, footprints
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, View
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -51,6 +51,16 @@ def test_what_no_small_picture_shows_keeps_all_that_it_may_touch():
     block = random_gaussians(5, size=0.2)
     block.opacities[:] = -30.0
     assert footprints(block, 0, views, DRAW, 0.995) == footprints(block, 0, views, DRAW)
+
+
+def test_no_crop_is_empty_where_small_pictures_show_other_gaussians():
+    """A small picture is blurred: it shows one just above the image, and not the faint one within."""
+    view = View(torch.eye(4), torch.tensor([[160.0, 0, 80], [0, 160, 60], [0, 0, 1]]), 160, 120)
+    block = random_gaussians(2, size=1e-4)
+    pixels = torch.tensor([[80.0, -2.2], [80.0, 100.0]])
+    block.means[:] = torch.cat(((pixels - view.K[:2, 2]) / 80, torch.full((2, 1), 2.0)), dim=1)
+    block.opacities[:] = torch.tensor([[9.0], [-30.0]])
+    assert footprints(block, 0, [view], DRAW, 0.995) == footprints(block, 0, [view], DRAW)
 
 
 def test_crops_have_room_for_the_windows_of_ssim():
