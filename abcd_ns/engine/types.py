@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -168,6 +169,15 @@ class View:
     def center(self) -> Float[Tensor, "3"]:
         """The camera's centre in world space: -R^T t."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    @cached_property
+    def numbers(self) -> Float[Tensor, "22"]:
+        """Rows of its rotation, translation, focal lengths, middle, width, height, centre, near plane."""
+        pose = (self.viewmat[:3, :3].reshape(-1), self.viewmat[:3, 3])
+        pinhole = (self.K[0, 0, None], self.K[1, 1, None], self.K[:2, 2])
+        size, near = ([self.width, self.height], [self.near])
+        rest = (self.viewmat.new_tensor(size), self.center, self.viewmat.new_tensor(near))
+        return torch.cat((*pose, *pinhole, *rest))
 
     def depths_of(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Camera z of points, world units, and which of them are in the image, beyond the near plane."""

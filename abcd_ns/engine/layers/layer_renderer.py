@@ -17,7 +17,7 @@ from cachetools import LRUCache, cached
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.render import CutShot, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.space.intervals import ray_interval
+from abcd_ns.engine.space.intervals import Rays, ray_interval, ray_intervals
 from abcd_ns.engine.space.tree import BlockTree, Box, node_children_in_order, nodes_in_order
 from abcd_ns.engine.space.visibility import Frusta, Optics, shared
 from abcd_ns.engine.store.scene import BlockScene
@@ -70,6 +70,11 @@ class Seen:
     def center(self) -> list[float]:
         """Of the camera, world space."""
         return self.view.center.double().tolist()
+
+    @cached_property
+    def rays(self) -> Rays:
+        """Through the window's tiles."""
+        return Rays.of(self.view, self.window.grid, self.window.near.device)
 
 
 @dataclass(frozen=True)
@@ -200,11 +205,14 @@ class LayerRenderer:
     def _cut(
         self, node: int, loaded: Loaded, seen: Sequence[Seen], settings: RenderSettings
     ) -> Iterator[FrozenLayers]:
-        shots = []
-        for one in seen:
-            crop = loaded.crops[one.view.index]
-            span, window = self.span(node, one.view, crop), one.window.on(self.rasterizer.window_grid(crop))
-            shots.append(CutShot(one.view, crop, *span.cut_by(window)))
+        crops = [loaded.crops[one.view.index] for one in seen]
+        rays = [one.rays.on(self.rasterizer.window_grid(crop)) for one, crop in zip(seen, crops, strict=True)]
+        with torch.no_grad():
+            spans = ray_intervals(self.tree.box(node), rays)
+        shots = [
+            CutShot(one.view, crop, *span.cut_by(one.window.on(span.grid)))
+            for one, crop, span in zip(seen, crops, spans, strict=True)
+        ]
         others = loaded.own < len(loaded.gaussians)
         cuts = self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings))
         for cut, shot in zip(cuts, shots, strict=True):

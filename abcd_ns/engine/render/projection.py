@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import Literal
 
 import torch
@@ -131,13 +132,19 @@ def project_in_torch(
 
 def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) -> Float[Tensor, "c"]:
     """A view as `splat` takes it, in the dtype and on the device of `like`; one copy to the device."""
-    viewmat, K = view.viewmat, view.K
-    options = viewmat.new_tensor([view.width, view.height, float(antialiased)])
+    learns = view.viewmat.requires_grad  # then each drawing has its own way back
+    size, center, near = (replace(view) if learns else view).numbers.tensor_split((18, 21))
+    antialiased, degrees = _options(sh_degree, antialiased, size.dtype, size.device)
+    return torch.cat((size, antialiased, center, near, degrees)).to(like)
+
+
+@lru_cache
+def _options(
+    sh_degree: int, antialiased: bool, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
     degrees = [float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)]
-    pinhole = (K[0, 0, None], K[1, 1, None], K[:2, 2])
-    pose = (viewmat[:3, :3].reshape(-1), viewmat[:3, 3])
-    rest = (options, view.center, viewmat.new_tensor([view.near, *degrees]))
-    return torch.cat((*pose, *pinhole, *rest)).to(like)
+    as_row = partial(torch.tensor, dtype=dtype, device=device)
+    return as_row([float(antialiased)]), as_row(degrees)
 
 
 def check_degree(gaussians: Gaussians, sh_degree: int) -> None:

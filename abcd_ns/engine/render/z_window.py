@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from abcd_ns.engine.transfer import finest
@@ -74,6 +74,20 @@ class TileGrid:
             counts.append((low + self.side).clamp_max(start + size) - low.clamp_min(start))
         return (counts[1][:, None] * counts[0]).flatten()
 
+    def part(self, values: Shaped[Tensor, "*c t"], grid: "TileGrid") -> Shaped[Tensor, "*c _t"]:
+        """What the tiles of a crop of this crop have of these values.
+
+        Raises:
+            ValueError: the grid's tiles are none of these.
+        """
+        if grid == self:
+            return values
+        x, y = grid.first_col - self.first_col, grid.first_row - self.first_row
+        if grid.side != self.side or min(x, y) < 0 or x + grid.cols > self.cols or y + grid.rows > self.rows:
+            raise ValueError(f"{self} has not all tiles of {grid}")
+        tiles = values.unflatten(-1, (self.rows, self.cols))
+        return tiles[..., y : y + grid.rows, x : x + grid.cols].flatten(-2)
+
     def to_tiles(self, image: Float[Tensor, "c h w"], fill: float = 0.0) -> Float[Tensor, "c t p"]:
         """[channel, tile, pixel in tile] from an image of the crop; `fill` where tiles stick out of it."""
         left, top = self.crop.x - self.first_col * self.side, self.crop.y - self.first_row * self.side
@@ -121,12 +135,7 @@ class ZWindow:
         """
         if grid == self.grid:
             return self
-        x, y, own = grid.first_col - self.grid.first_col, grid.first_row - self.grid.first_row, self.grid
-        if grid.side != own.side or min(x, y) < 0 or x + grid.cols > own.cols or y + grid.rows > own.rows:
-            raise ValueError(f"a window on {own} says nothing about {grid}")
-        rows, cols = slice(y, y + grid.rows), slice(x, x + grid.cols)
-        near, far = (ends.view(own.rows, own.cols)[rows, cols].flatten() for ends in (self.near, self.far))
-        return ZWindow(grid, near, far)
+        return ZWindow(grid, self.grid.part(self.near, grid), self.grid.part(self.far, grid))
 
 
 def ends_of(window: ZWindow | None, grid: TileGrid, like: Tensor) -> Float[Tensor, "2 t"]:

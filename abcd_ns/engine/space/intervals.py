@@ -24,6 +24,8 @@ diagonal at most; tests of reach allow for that (see visibility.py).
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -31,6 +33,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.z_window import TileGrid, ZWindow
 from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import View
 
 
@@ -40,42 +43,65 @@ def ray_directions(view: View, grid: TileGrid, device: torch.device | str = "cpu
     In the view's dtype. Skew is ignored, as gsplat does. A tile's direction does not depend on the crop, bit
     for bit: only elementwise operations are used. With tiles of one pixel these are the pixels' own rays.
     """
-    K = view.K
-    numbers = torch.cat((view.viewmat[:3, :3].reshape(-1), K[0, 0, None], K[1, 1, None], K[:2, 2]))
-    *rotation, fx, fy, cx, cy = numbers.to(device).unbind(0)
+    *rotation, _, _, _, fx, fy, cx, cy = view.numbers[:16].to(device).unbind(0)
     u, v = grid.middles(view.viewmat.dtype, device)
     x, y = ((u - cx) / fx)[None, :], ((v - cy) / fy)[:, None]
     rows = (rotation[k] * x + rotation[3 + k] * y + rotation[6 + k] for k in range(3))
     return torch.stack([row.flatten() for row in rows])
 
 
+@dataclass(frozen=True)
+class Rays:
+    """The rays through the middles of a crop's tiles."""
+
+    center: list[float]
+    """Of the camera, world space."""
+    grid: TileGrid
+    directions: Float[Tensor, "3 t"]
+    """See ray_directions."""
+
+    @staticmethod
+    def of(view: View, grid: TileGrid, device: torch.device | str = "cpu") -> "Rays":
+        return Rays(view.center.tolist(), grid, ray_directions(view, grid, device))
+
+    def on(self, grid: TileGrid) -> "Rays":
+        """Those of a crop of this crop."""
+        return Rays(self.center, grid, self.grid.part(self.directions, grid))
+
+
 def ray_interval(box: Box, view: View, grid: TileGrid, device: torch.device | str = "cpu") -> ZWindow:
-    """The half-open interval of camera z in which each tile's middle ray is inside `box`.
+    """`ray_intervals` of one crop."""
+    return ray_intervals(box, [Rays.of(view, grid, device)])[0]
+
+
+def ray_intervals(box: Box, rays: Sequence[Rays]) -> list[ZWindow]:
+    """The half-open intervals of camera z in which rays are inside `box`; all crops in one pass.
 
     `near` is -inf where the camera itself is inside the box, so that nothing in front of it is lost.
     Rays that miss the box get the empty interval near = far = +inf, so [-inf, near) is then all of z.
     """
-    directions = ray_directions(view, grid, device)
-    near = torch.full_like(directions[0], -math.inf)
-    far = torch.full_like(directions[0], math.inf)
-    numbers = (view.center.tolist(), box.lower.tolist(), box.upper.tolist())
-    for direction, c, lower, upper in zip(directions, *numbers, strict=True):
-        for plane, box_is_right in ((lower, True), (upper, False)):
-            if math.isinf(plane):
-                continue
-            if (c >= plane) == box_is_right:
-                far = torch.minimum(far, _crossing(plane, c, direction))
-            else:
-                near = torch.maximum(near, _crossing(plane, c, direction))
+    counts, directions = [one.grid.tiles for one in rays], torch.cat([one.directions for one in rays], dim=1)
+    faces = [(axis, at, True) for axis, at in enumerate(box.lower.tolist())]
+    faces += [(axis, at, False) for axis, at in enumerate(box.upper.tolist())]
+    faces = [face for face in faces if math.isfinite(face[1])]
+    if not faces:
+        return [ZWindow.everything(one.grid, directions.device, directions.dtype) for one in rays]
+    sides = [[_side(one.center[axis], at, is_lower) for axis, at, is_lower in faces] for one in rays]
+    of_views = upload(torch.tensor(sides, dtype=directions.dtype), directions.device).unbind(0)
+    spread = [side.T[..., None].expand(-1, -1, n) for side, n in zip(of_views, counts, strict=True)]
+    offset, ahead, is_far = torch.cat(spread, dim=2)
+    along = torch.stack([directions[axis] for axis, *_ in faces])
+    # Camera z at which rays leave the camera's side of each plane; +inf where they never do.
+    crossing = torch.where(along * ahead > 0, offset / along, math.inf)
+    near = torch.where(is_far > 0, -math.inf, crossing).amax(dim=0)
+    far = torch.where(is_far > 0, crossing, math.inf).amin(dim=0)
     # The planes of several axes can pass the ray by in any order: near > far, or a far before the camera.
-    empty = near >= far
-    return ZWindow(grid, near.masked_fill(empty, math.inf), far.masked_fill(empty, math.inf))
+    ends = torch.where(near >= far, math.inf, torch.stack((near, far))).split(counts, dim=1)
+    return [ZWindow(one.grid, *both) for one, both in zip(rays, ends, strict=True)]
 
 
-def _crossing(plane: float, center: float, direction: Float[Tensor, "t"]) -> Float[Tensor, "t"]:
-    """Camera z at which rays leave the camera's side of x_k = plane; +inf where they never do."""
-    leaves = direction < 0 if center >= plane else direction > 0
-    # A 0-dimensional tensor, because torch turns float / tensor into a product with the reciprocal. On the
-    # CPU, whatever the device: kernels take it as a number.
-    offset = torch.tensor(plane - center, dtype=direction.dtype)
-    return torch.where(leaves, offset / direction, math.inf)
+def _side(center: float, plane: float, box_is_right: bool) -> tuple[float, float, float]:
+    """Of a camera and a plane x_k = plane: the way to it along x_k; the sign of what leads there; and 1 where
+    the box ends at it, 0 where it begins. Decided in float64, see above."""
+    is_right = center >= plane
+    return plane - center, -1.0 if is_right else 1.0, float(is_right == box_is_right)

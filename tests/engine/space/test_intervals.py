@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render.z_window import TileGrid
-from abcd_ns.engine.space.intervals import ray_directions, ray_interval
+from abcd_ns.engine.space.intervals import Rays, ray_directions, ray_interval, ray_intervals
 from abcd_ns.engine.space.tree import BlockTree, front_to_back
 from abcd_ns.engine.types import Crop, View
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
@@ -100,6 +100,24 @@ def test_a_crop_of_the_windows_is_the_windows_of_the_crop(seed, dtype, x, y, sid
         part = ray_interval(tree.cell(block), view, TileGrid(crop, side))
         assert torch.equal(part.near, whole.on(part.grid).near)
         assert torch.equal(part.far, whole.on(part.grid).far)
+
+
+@given(SEEDS, DTYPES)
+def test_crops_of_several_views_in_one_pass_are_each_as_alone(seed, dtype):
+    views = [random_view(seed + k, dtype) for k in range(3)]
+    tree = tree_around(seed, views[0])
+    grids = [TileGrid(Crop(k, 0, 6 - k, 5), 1 + k) for k in range(3)]
+    rays = [
+        Rays.of(view, TileGrid(view.full, grid.side)).on(grid)
+        for view, grid in zip(views, grids, strict=True)
+    ]
+    for block in range(tree.num_blocks):
+        together = ray_intervals(tree.cell(block), rays)
+        for view, grid, found in zip(views, grids, together, strict=True):
+            alone = ray_interval(tree.cell(block), view, grid)
+            assert found.grid == grid
+            assert torch.equal(found.near, alone.near)
+            assert torch.equal(found.far, alone.far)
 
 
 @pytest.mark.parametrize("side", [2, 4])
