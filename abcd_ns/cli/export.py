@@ -17,7 +17,7 @@ from torch import Tensor
 
 from abcd_ns.cli.paths import check_file, find_run
 from abcd_ns.engine.gaussians.block_state import DRAWN, IS_DEFERRED, Packed
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
@@ -112,13 +112,13 @@ def check_request(out: Path, box: Box | None) -> None:
         raise UserError("--box needs X0 < X1, Y0 < Y1 and Z0 < Z1.")
 
 
-def to_data(run: Path) -> Frame:
+def to_data(run: Path) -> Similarity:
     """From the run's frame back to that of the data; UserError where the file is missing or damaged."""
     path = run / TRANSFORMS
     try:
         found = json.loads(path.read_text())
         matrix = torch.tensor(found["transform"], dtype=torch.float64).reshape(3, 4)
-        return Frame.of(matrix, found["scale"]).inverse
+        return Similarity.of(matrix, found["scale"]).inverse
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} cannot be read ({error}); use --frame nerfstudio.") from None
 
@@ -151,7 +151,7 @@ class Shown:
     in their own without any."""
 
     store: ParameterStore
-    to: Frame | None
+    to: Similarity | None
     box: Box | None
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.frames import quaternion
+from abcd_ns.engine.gaussians.similarity import quaternion
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError

@@ -10,12 +10,12 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
 
-OPENGL = Frame(torch.diag(torch.tensor([1.0, -1, -1]).double()), torch.zeros(3).double(), 1.0)
+OPENGL = Similarity(torch.diag(torch.tensor([1.0, -1, -1]).double()), torch.zeros(3).double(), 1.0)
 """To .spz's axes, right, up, back, from .ply's: right, down, front (nianticlabs/spz, README). Its readers
 turn them back, but gaussforge 0.6 does not turn them."""
 MOST_SOG = 1 << 16

@@ -53,7 +53,7 @@ def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool =
             lods[str(level)] = {"file": len(files), "offset": 0, "count": len(gaussians)}
             files.append(f"{name}/meta.json")
             counts[level] += len(gaussians)
-            gaussians = coarser(gaussians)
+            gaussians = merged_in_pairs(gaussians)
         leaves.append({"bound": bound, "lods": lods})
     meta = {
         "version": 1,
@@ -89,7 +89,7 @@ def _tree(nodes: list[dict[str, Any]]) -> dict[str, Any]:
     return {"bound": bound, "children": children}
 
 
-def coarser(gaussians: Gaussians) -> Gaussians:
+def merged_in_pairs(gaussians: Gaussians) -> Gaussians:
     """A little more than half as many: pairs of neighbours are merged, first those that lose least."""
     if len(gaussians) < 2:
         return gaussians

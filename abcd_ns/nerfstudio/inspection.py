@@ -14,7 +14,7 @@ from abcd_ns.data.dataset import PHOTOS, has_views, with_photos
 from abcd_ns.data.input_errors import InputError, say
 from abcd_ns.data.ply import is_antialiased, some_means
 from abcd_ns.data.prepare import check_masks
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
@@ -39,7 +39,7 @@ class Inspected:
     """By which the photos' width and height are divided."""
     cloud: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), compare=False)
     """The points, in the run's frame, [n, 3]."""
-    to_run: Frame | None = field(default=None, compare=False)
+    to_run: Similarity | None = field(default=None, compare=False)
     """From the frame of the photos' poses."""
     capture: DataparserOutputs | None = field(default=None, compare=False)
     """The photos to train on and their cameras."""
@@ -81,7 +81,7 @@ def inspect(config: DataParserConfig) -> Inspected:
     largest = max((source.size for source in sources), key=lambda size: size[0] * size[1])
     train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
     cloud = np.asarray(parts[0].metadata.get("points3D_xyz", np.zeros((0, 3))))
-    to_run = Frame.of(parts[0].dataparser_transform, parts[0].dataparser_scale)
+    to_run = Similarity.of(parts[0].dataparser_transform, parts[0].dataparser_scale)
     return Inspected(train, held_out, largest, len(cloud), factor_of(parser), cloud, to_run, parts[0])
 
 

@@ -29,7 +29,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene, ChangedScene, MemoryScene, StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.train.memory import free_bytes, frozen_bytes
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
@@ -316,7 +316,7 @@ class AbcdModel(SplatfactoModel):
 
     def _most_at_once(self) -> int:
         """Gaussians that the device's free memory allows to draw at once."""
-        of_each = drawing_bytes(self.config.sh_degree, self.config.primitive)
+        of_each = frozen_bytes(self.config.sh_degree, self.config.primitive)
         return int(FREE_SHARE * free_bytes(self.device)) // of_each
 
     def _crop(self, gaussians: Gaussians) -> Gaussians:

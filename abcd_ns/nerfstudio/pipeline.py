@@ -15,8 +15,8 @@ from nerfstudio.utils.misc import step_check
 from abcd_ns.data.input_errors import say
 from abcd_ns.data.ply import GREY, read_gaussians
 from abcd_ns.engine.events import HeldOutScored
-from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.initialize import PointCloud, random_points
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
@@ -243,7 +243,7 @@ class AbcdPipeline(VanillaPipeline):
             found, lost = read_gaussians(model.init_splats)
             note = f" {lost:,} others hold NaN, or no rotation." if lost else ""
             say(f"Starting with {len(found):,} Gaussians of {model.init_splats}.{note}")
-            to = Frame.of(read.dataparser_transform, read.dataparser_scale)
+            to = Similarity.of(read.dataparser_transform, read.dataparser_scale)
             return to.gaussians(found).of_degree(training.sh_degree)
         if len(points) and not model.random_init:
             if len(colors) != len(points):  # as of a .ply without colours

@@ -12,7 +12,7 @@ from plyfile import PlyData
 
 from abcd_ns.cli.export import TRANSFORMS, export, tell_rounding
 from abcd_ns.engine.gaussians.block_state import BlockState, Packed
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.coarse_model import stored_blocks
@@ -25,7 +25,7 @@ from tests.reference.scenes import random_gaussians
 BLOCKS = 5
 ROTATION = torch.linalg.qr(torch.tensor([[1.0, 2, 3], [-1, 1, 0.5], [0, 2, -1]], dtype=torch.float64))[0]
 ROTATION = ROTATION * torch.linalg.det(ROTATION).sign()
-FRAME = Frame(ROTATION, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64), 0.04)
+FRAME = Similarity(ROTATION, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64), 0.04)
 
 
 @pytest.fixture

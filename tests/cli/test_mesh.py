@@ -15,7 +15,7 @@ from abcd_ns.cli.export import TRANSFORMS
 from abcd_ns.cli.mesh.command import mesh
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
 from abcd_ns.cli.mesh.fusion import Fusion, Piece, weld, without_specks
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.layer_renderer import LayerRenderer, RenderSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -140,7 +140,7 @@ def write_run(place: Path, **header: Any) -> Path:
     write_settings(config, flat_options(config), folder / "abcd")
     outputs = config.pipeline.datamanager.reader().setup().get_dataparser_outputs("train")
     outputs.save_dataparser_transform(folder / TRANSFORMS)
-    to_run = Frame.of(outputs.dataparser_transform, outputs.dataparser_scale)
+    to_run = Similarity.of(outputs.dataparser_transform, outputs.dataparser_scale)
     x, y = torch.meshgrid(torch.arange(-3, 3, 0.08), torch.arange(-2, 2, 0.08), indexing="xy")
     means = torch.stack((x.flatten(), y.flatten(), torch.zeros(x.numel())), dim=1)
     colors = torch.where(means[:, :1] > 0, torch.tensor(RIGHT) / 255, torch.tensor(LEFT) / 255)

@@ -12,7 +12,7 @@ import abcd_ns
 from abcd_ns.cli import export as export_module
 from abcd_ns.errors import UserError
 from abcd_ns.formats import streamed
-from abcd_ns.formats.streamed import MOST_OPAQUE, coarser, merged, pairs
+from abcd_ns.formats.streamed import MOST_OPAQUE, merged, merged_in_pairs, pairs
 from tests.cli.test_export import export, run, scene  # noqa: F401
 from tests.reference.scenes import random_gaussians
 
@@ -58,7 +58,7 @@ def test_pairs_take_each_row_once_and_leave_no_two_that_could_be_merged():
     first, second = pairs(gaussians)
     rows = torch.cat([first, second]).tolist()
     assert len(rows) == len(set(rows))
-    assert 150 <= len(coarser(gaussians)) <= 180
+    assert 150 <= len(merged_in_pairs(gaussians)) <= 180
     alone = [row for row in range(300) if row not in rows]
     near = torch.cdist(gaussians.means, gaussians.means).argsort(dim=1)[:, 1:9].tolist()
     assert all(other not in near[row] for row in alone for other in alone)
@@ -66,8 +66,8 @@ def test_pairs_take_each_row_once_and_leave_no_two_that_could_be_merged():
 
 def test_few_stay_as_they_are():
     one = random_gaussians(1, sh_degree=2)
-    assert torch.equal(coarser(one).means, one.means)
-    twice = coarser(coarser(random_gaussians(2, sh_degree=2)))
+    assert torch.equal(merged_in_pairs(one).means, one.means)
+    twice = merged_in_pairs(merged_in_pairs(random_gaussians(2, sh_degree=2)))
     assert len(twice) == 1
 
 
@@ -97,7 +97,7 @@ def test_a_coarser_level_looks_alike_and_better_than_a_random_half():
     level = whole = wall()
     picture = drawn(whole)
     for _ in range(2):
-        level = coarser(level)
+        level = merged_in_pairs(level)
         kept = whole[torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: len(level)]]
         coarse, random = ((drawn(each) - picture).square().mean() for each in (level, kept))
         assert float(coarse) < 0.05 * float(random)

@@ -15,7 +15,7 @@ from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, frozen_bytes, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
@@ -114,7 +114,7 @@ def test_what_a_frozen_gaussian_takes_while_layers_are_drawn(tmp_path, simulated
         peaks.append((frozen, peak_of_layers(simulated_gsplat, coordinator)))
     (few, small), (many, large) = peaks
     slope = (large - small) / (many - few)
-    assert slope <= drawing_bytes(3, "3dgs") <= LAVISH_GAUSSIAN * slope
+    assert slope <= frozen_bytes(3, "3dgs") <= LAVISH_GAUSSIAN * slope
 
 
 @pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])

@@ -11,13 +11,13 @@ import tyro
 
 from abcd_ns.cli.export import Box, check_request, stored, tell_rounding, to_data
 from abcd_ns.cli.paths import find_run
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.errors import UserError
 from abcd_ns.run import SETTINGS_FILE, STORE
 from abcd_ns.units import bytes_in_words
 
-STAY = Frame(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
+STAY = Similarity(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
 
 
 def mesh(

@@ -13,7 +13,7 @@ from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.train.memory import free_bytes, frozen_bytes
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.options import mirror
@@ -83,7 +83,7 @@ def open_views(
         raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
     ram = RamShares.of(config.ram_budget_gb)
     scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
-    of_each = drawing_bytes(config.training.sh_degree, config.training.primitive)
+    of_each = frozen_bytes(config.training.sh_degree, config.training.primitive)
     room = int(FREE_SHARE * free_bytes(device)) // of_each
     renderer = LayerRenderer(
         scene,

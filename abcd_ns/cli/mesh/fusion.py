@@ -22,7 +22,7 @@ from torch import Tensor
 
 from abcd_ns.cli.export import Box, inside
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -133,7 +133,7 @@ def _image(values: np.ndarray) -> Any:
     return open3d.t.geometry.Image(core.Tensor(values))
 
 
-def fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> tuple[Piece, float]:
+def fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Similarity) -> tuple[Piece, float]:
     """The surface within the box, and the side of its voxels, in world units of the run."""
     footprints = maps.footprints()
     if not len(footprints):
@@ -145,7 +145,7 @@ def fuse(maps: DepthMaps, voxel: float | None, box: Box | None, to: Frame) -> tu
     return surface, side
 
 
-def _within(box: Box | None, to: Frame, piece: Piece) -> Piece:
+def _within(box: Box | None, to: Similarity, piece: Piece) -> Piece:
     """The faces whose middles are in the box, if there is one, in the frame `to`."""
     if box is None:
         return piece

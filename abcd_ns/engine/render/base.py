@@ -37,7 +37,7 @@ class Raster:
         return Layer(self.color, self.transmittance)
 
 
-class Frame(NamedTuple):
+class Surroundings(NamedTuple):
     """What a drawn crop is shown in: two layers or none, a background, and what a pixel weighs."""
 
     front: Layer | None
@@ -47,8 +47,8 @@ class Frame(NamedTuple):
     """The gradient by the depth of a pixel that nothing hides, whatever the loss."""
 
 
-Shown = tuple[tuple[slice, slice], Frame]
-"""Rows and columns of a crop in what gsplat has drawn, and its frame."""
+Shown = tuple[tuple[slice, slice], Surroundings]
+"""Rows and columns of a crop in what gsplat has drawn, and its surroundings."""
 
 
 @dataclass(frozen=True)

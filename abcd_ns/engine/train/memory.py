@@ -96,7 +96,7 @@ class DeviceNeeds:
     def frozen_beside(self, active: int) -> int:
         """Frozen Gaussians that a pass may draw in the room for gradients and drawings of active ones."""
         free = active * (self.gaussian_bytes - 3 * self.parameter_bytes)
-        return free // drawing_bytes(self.sh_degree, self.primitive)
+        return free // frozen_bytes(self.sh_degree, self.primitive)
 
     @property
     def parts_bytes(self) -> int:
@@ -190,7 +190,7 @@ def projected_bytes(primitive: PrimitiveName) -> int:
     return round(PROJECTED_FLOATS * PRIMITIVES[primitive].rows) * FLOAT
 
 
-def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
+def frozen_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
     """Of a Gaussian that is drawn without gradients: its parameters and its rows of one view, both twice."""
     return 2 * parameter_bytes(sh_degree) + 2 * PRIMITIVES[primitive].rows * FLOAT
 

@@ -219,7 +219,9 @@ class VisitTraining:
         lights = tuple(None if run.light is None else run.light.of(view.index) for view in views)
         pictures = None
         if run.light is None:
-            pictures = pictures_of(rasters, [sample.frame(run.density.config.prunes) for sample in samples])
+            pictures = pictures_of(
+                rasters, [sample.surroundings(run.density.config.prunes) for sample in samples]
+            )
         if pictures is None:
             pictures = tuple(map(self._picture, samples, rasters, lights))
         return Rendered(pictures, rasters, infos, lights, views)

@@ -19,7 +19,7 @@ from PIL import Image
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.param_swap import active_gaussians
 from abcd_ns.engine.layers.layer_renderer import default_pass
-from abcd_ns.engine.train.memory import DeviceNeeds, drawing_bytes, needs_of_step
+from abcd_ns.engine.train.memory import DeviceNeeds, frozen_bytes, needs_of_step
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
@@ -135,7 +135,7 @@ class Training:
             most = config.limits.pass_gaussians or default_pass(coordinator.scene)
             frozen = min(most, coordinator.count() - gaussians) if config.recipe.layers else 0
             held = gaussians * 3 * needs.parameter_bytes
-            held += frozen * drawing_bytes(config.sh_degree, config.primitive)
+            held += frozen * frozen_bytes(config.sh_degree, config.primitive)
         self.gaussian_bytes = max(self.gaussian_bytes, held)
 
     def _end_step(self, step: int) -> None:

@@ -27,7 +27,7 @@ for height, width in ((11, 11), (11, 40), (29, 12), (33, 61)):
 BETWEEN = """
 import torch
 from abcd_ns.engine.render.cuda.between import between
-from abcd_ns.engine.render.base import Frame
+from abcd_ns.engine.render.base import Surroundings
 from abcd_ns.engine.types import Layer
 from tests.reference import triton_stand_ins as twins
 
@@ -47,7 +47,7 @@ for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
     for rows, columns in parts:
         size = rows.stop - rows.start, columns.stop - columns.start
         pair = (layer(*size), layer(*size)) if layers else (None, None)
-        shown.append(((rows, columns), Frame(*pair, values(3), counts)))
+        shown.append(((rows, columns), Surroundings(*pair, values(3), counts)))
     found, expected = between(features, alphas, shown), twins.between(features, alphas, shown)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
     upstream = [values(*picture.shape) - 0.5 for picture in found]

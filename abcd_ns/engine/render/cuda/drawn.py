@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from abcd_ns.engine.render.base import Frame, Raster, Shown
+from abcd_ns.engine.render.base import Raster, Shown, Surroundings
 from abcd_ns.engine.render.cuda import fused
 
 
@@ -67,9 +67,9 @@ class _Pictures(torch.autograd.Function):
 
 
 def pictures_of(
-    rasters: Sequence[Raster], frames: Sequence[Frame]
+    rasters: Sequence[Raster], around: Sequence[Surroundings]
 ) -> tuple[Float[Tensor, "_h _w 3"], ...] | None:
-    """What rasters, all of one `draw`, look like in their frames, 0..1; None where no kernel can tell."""
+    """Pictures of rasters, all of one `draw`, 0..1; None where no kernel can tell."""
     sheets: dict[int, list[int]] = {}
     for k, raster in enumerate(rasters):
         if not isinstance(raster, Drawn):
@@ -77,7 +77,7 @@ def pictures_of(
         sheets.setdefault(id(raster.features), []).append(k)
     pictures: dict[int, Tensor] = {}
     for places in sheets.values():
-        of, shown = rasters[places[0]], [(rasters[k].part, frames[k]) for k in places]
+        of, shown = rasters[places[0]], [(rasters[k].part, around[k]) for k in places]
         found = fused.between(of.features, of.alphas, shown)
         if found is None:
             return None

@@ -14,7 +14,7 @@ from torch import Tensor
 from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
-from abcd_ns.engine.render.base import Frame, ResidualSums
+from abcd_ns.engine.render.base import ResidualSums, Surroundings
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
@@ -89,10 +89,10 @@ class Sample:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
         return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
 
-    def frame(self, blend_weights: bool) -> Frame:
+    def surroundings(self, blend_weights: bool) -> Surroundings:
         """What the drawing is shown in, see `picture`; for `blend_weights` see `with_blend_weights`."""
         front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
-        return Frame(front, back, self.background, blend_weights / self.share)
+        return Surroundings(front, back, self.background, blend_weights / self.share)
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig

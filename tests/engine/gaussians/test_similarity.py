@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
-from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.render import TorchRasterizer
 from tests.engine.space.test_tree import SEEDS
 from tests.reference.rasterizer_scenes import assert_same_layer
@@ -19,7 +19,7 @@ from tests.reference.scenes import random_gaussians, ring_of_views
 def test_a_moved_scene_looks_the_same_to_a_camera_that_moves_along(seed):
     generator = np.random.RandomState(seed)
     turn = torch.from_numpy(Rotation.random(random_state=generator).as_matrix())
-    frame = Frame(turn, torch.from_numpy(generator.normal(size=3)), math.exp(generator.normal()))
+    frame = Similarity(turn, torch.from_numpy(generator.normal(size=3)), math.exp(generator.normal()))
     # The blur of 0.3 pixels does not depend on units, nor does anything else that is drawn.
     gaussians = random_gaussians(40, seed, sh_degree=3, dtype=torch.float64)
     (view,) = ring_of_views(1, dtype=torch.float64)

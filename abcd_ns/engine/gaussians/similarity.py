@@ -17,7 +17,7 @@ DIRECTIONS = 64
 
 
 @dataclass(frozen=True)
-class Frame:
+class Similarity:
     """A change of frame: x becomes scale x (rotation x + translation)."""
 
     rotation: Float[Tensor, "3 3"]
@@ -27,15 +27,15 @@ class Frame:
     scale: float
 
     @staticmethod
-    def of(transform: Float[Tensor, "3 4"], scale: float) -> "Frame":
+    def of(transform: Float[Tensor, "3 4"], scale: float) -> "Similarity":
         """Of a dataparser: its transform, and the scale after that."""
         matrix = transform.double()
-        return Frame(matrix[:, :3], matrix[:, 3], float(scale))
+        return Similarity(matrix[:, :3], matrix[:, 3], float(scale))
 
     @property
-    def inverse(self) -> "Frame":
+    def inverse(self) -> "Similarity":
         turned = self.rotation.T @ self.translation
-        return Frame(self.rotation.T, -self.scale * turned, 1 / self.scale)
+        return Similarity(self.rotation.T, -self.scale * turned, 1 / self.scale)
 
     def points(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Points in the new frame, float64."""
