@@ -52,7 +52,7 @@ class VisitEnded:
     """Gaussians that left for other blocks."""
     layer_seconds: float
     """Training time that went into drawing F and B."""
-    seconds: float
+    visit_seconds: float
     """Training time of the whole visit."""
 
 

@@ -31,7 +31,7 @@ def check_workers(config: TrainerConfig) -> None:
         raise UserError("This method has no workers: leave out --pipeline.workers and --pipeline.cluster.")
     if 0 < blocks <= workers:
         raise UserError(
-            f"{workers} workers need more than {blocks} blocks: leave --pipeline.blocks out, or give "
+            f"{workers} workers need {workers + 1} blocks or more: leave --pipeline.blocks out, or give "
             f"{BLOCKS_EACH * workers}."
         )
 

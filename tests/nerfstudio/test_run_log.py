@@ -145,7 +145,7 @@ def test_the_psnr_of_a_visit_is_that_of_its_later_half(log, path):
     log(VisitBegan(0, 0, 1, steps=4, views=4, gaussians=50))
     for psnr in (10.0, 12.0, 20.0, 22.0):
         take_steps(log, 1, seconds=0.1, psnr=psnr)
-    log(VisitEnded(0, 0, 1, gaussians=50, migrated=2, layer_seconds=0.1, seconds=0.4))
+    log(VisitEnded(0, 0, 1, gaussians=50, migrated=2, layer_seconds=0.1, visit_seconds=0.4))
     log(EpochEnded(0, 4))
     log.close()
     (ended,) = lines_of(path, "visit end")
@@ -155,7 +155,7 @@ def test_the_psnr_of_a_visit_is_that_of_its_later_half(log, path):
 def test_a_visit_is_on_disk_when_it_has_ended_and_a_long_one_before(log, path):
     take_steps(log, 10, seconds=1.0)
     assert len(lines_of(path)) == 1
-    log(VisitEnded(0, 0, 1, gaussians=50, migrated=0, layer_seconds=0.1, seconds=0.4))
+    log(VisitEnded(0, 0, 1, gaussians=50, migrated=0, layer_seconds=0.1, visit_seconds=0.4))
     before = lines_of(path)
     assert before[-1]["kind"] == "visit end"
     take_steps(log, 2 * run_log.LINES_KEPT, seconds=1.0)

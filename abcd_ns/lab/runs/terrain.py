@@ -77,7 +77,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
             base_rss_bytes=base,
             make_seconds=made - began,
             plan_seconds=steps[0][0] - made,
-            visit_seconds=fmean(visit.seconds for visit in usual) if usual else None,
+            visit_seconds=fmean(visit.visit_seconds for visit in usual) if usual else None,
             layer_seconds=fmean(visit.layer_seconds for visit in usual) if usual else None,
         ),
     )

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from abcd_ns.engine.events import EpochEnded, PrunedAtEnd, VisitBegan, WorkerLost
+from abcd_ns.engine.events import EpochEnded, HeldOutScored, PrunedAtEnd, VisitBegan, VisitEnded, WorkerLost
 
 SCHEMA = 2  # raised whenever a line changes its form or meaning
 
@@ -55,18 +55,9 @@ class SampleLine(Line):
 
 
 @dataclass(frozen=True)
-class VisitEndLine(Line):
+class VisitEndLine(VisitEnded, Line):
     """A visit ended and its block is persisted."""
 
-    visit: int
-    epoch: int
-    block: int | None
-    gaussians: int
-    """In the block, after migration."""
-    migrated: int
-    """Gaussians that left for other blocks."""
-    layer_seconds: float
-    visit_seconds: float
     psnr: float | None
     """Mean of training crops in the visit's later half, dB."""
 
@@ -104,12 +95,11 @@ class WorkerLine(Line):
 
 
 @dataclass(frozen=True)
-class HeldOutLine(Line):
+class HeldOutLine(HeldOutScored, Line):
     """Means over the held-out views."""
 
     psnr: float | None
     """dB; None where it is not finite."""
-    ssim: float | None
 
 
 @dataclass(frozen=True)

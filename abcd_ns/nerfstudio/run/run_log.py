@@ -97,9 +97,8 @@ class RunLog:
     def _end_visit(self, event: events.VisitEnded) -> None:
         self._sample()
         psnrs = self._visit_psnrs.pop(event.visit, [])
-        told = vars(event) | {"layer_seconds": round(event.layer_seconds, 3)}
-        seconds = round(told.pop("seconds"), 3)  # a line's own are of the whole run
-        self._note("visit end", **told, visit_seconds=seconds, psnr=_mean(psnrs[len(psnrs) // 2 :]))
+        seconds = {name: round(getattr(event, name), 3) for name in ("layer_seconds", "visit_seconds")}
+        self._note("visit end", **vars(event) | seconds, psnr=_mean(psnrs[len(psnrs) // 2 :]))
         self._flush()
 
     def _sample(self) -> None:
