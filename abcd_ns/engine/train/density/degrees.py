@@ -18,6 +18,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, active_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, up_to_degree
 from abcd_ns.engine.train.density.pruning import contributions, have_contributions
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
@@ -78,8 +79,8 @@ def lowered(
     degree. None is judged that was not drawn in all views yet."""
     weight = contributions(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
-    chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
-    numbers = torch.stack([_numbers(view) for view in chosen]).to(gaussians.means.dtype)
+    chosen = evenly(views, MOST_VIEWS)
+    numbers = torch.stack([view.numbers for view in chosen]).to(gaussians.means.dtype)
     cameras = upload(numbers, gaussians.means.device)
     coefficients = gaussians.features_rest.shape[1] + 1
     room = max(AT_ONCE, OF_EACH * len(gaussians))
@@ -89,17 +90,11 @@ def lowered(
     return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
 
 
-def _numbers(view: View) -> Float[Tensor, "28"]:
-    """World-to-camera matrix and intrinsics, row by row; width and height, px; the near plane."""
-    ends = view.K.new_tensor([view.width, view.height, view.near])
-    return torch.cat((view.viewmat.flatten(), view.K.flatten(), ends))
-
-
 def _lowered(
     gaussians: Gaussians,
     weight: Float[Tensor, "n"],
     gone: Float[Tensor, "n"],
-    cameras: Float[Tensor, "v 28"],
+    cameras: Float[Tensor, "v 22"],
     highest: int,
 ) -> Lowered:
     """As `lowered`, at once; a weight, pixels in all views, is NaN for one that is not judged."""
@@ -130,24 +125,22 @@ def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: 
     return torch.cat((values[:, :kept] + more, torch.zeros_like(values[:, kept:])), dim=1)
 
 
-def _gram(gaussians: Gaussians, cameras: Float[Tensor, "v 28"], bases: int) -> Float[Tensor, "n b b"]:
+def _gram(gaussians: Gaussians, cameras: Float[Tensor, "v 22"], bases: int) -> Float[Tensor, "n b b"]:
     """Mean products of the harmonics in the directions of views. Each view counts by the square of a
     Gaussian's size there, and not at all where it is beside the picture. NaN where none shows it."""
-    means, (viewmats, intrinsics, ends) = gaussians.means, cameras.split((16, 9, 3), dim=1)
-    viewmats, intrinsics = viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3)
-    turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    means = gaussians.means
+    turns, shifts, focal, middle, size, centers, near = cameras.split((9, 3, 2, 2, 2, 3, 1), dim=1)
+    turns, near = turns.view(-1, 3, 3), near[:, 0]
     # Matrices of Gaussians by views, for each axis.
     x, y, z = (means @ turn.T + shift for turn, shift in zip(turns.unbind(1), shifts.unbind(1), strict=True))
-    width, height, near = ends.unbind(dim=1)
-    per_unit = intrinsics[:, 0, 0] / torch.maximum(z, near)
+    per_unit = focal[:, 0] / torch.maximum(z, near)
     beyond = REACH * gaussians.scales.amax(dim=1, keepdim=True).exp() * per_unit
     seen = z > near
-    for row, end in ((0, width), (1, height)):
-        place = (intrinsics[:, row, 0] * x + intrinsics[:, row, 1] * y) / z + intrinsics[:, row, 2]
-        seen &= (place > -beyond) & (place < end + beyond)
+    for axis, offset in enumerate((x, y)):
+        place = focal[:, axis] * offset / z + middle[:, axis]
+        seen &= (place > -beyond) & (place < size[:, axis] + beyond)
     counts = torch.where(seen, per_unit.square(), 0.0)
     counts = counts / counts.sum(dim=1, keepdim=True)
-    centers = -(turns.mT @ shifts[..., None])[..., 0]
     away = [means[:, axis, None] - centers[:, axis] for axis in range(3)]
     distance = sum(part.square() for part in away).sqrt().clamp_min(1e-12)
     harmonics = sh_basis_rows(*(part / distance for part in away))[: bases - 1]
