@@ -10,7 +10,10 @@ from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
 
+OF_DENSITY = ("max_gaussians", "min_contribution", "split_pixels", "refine_every")
+OF_TRAINING = ("batch", "point_pixels", "commit_seconds", *(f"density.{name}" for name in OF_DENSITY))
 NOT_BELOW_0 = ("blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb", "workers")
+NOT_BELOW_0 += tuple(f"training.{name}" for name in OF_TRAINING)
 
 
 @dataclass

@@ -1,7 +1,6 @@
 """How a scene is trained: every option of the engine, with its default."""
 
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Literal
 
 from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
@@ -11,9 +10,6 @@ from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
-
-_OF_DENSITY = ("max-gaussians", "min-contribution", "split-pixels", "refine-every")
-NOT_BELOW_0 = ("batch", "point-pixels", "commit-seconds", *(f"density.{name}" for name in _OF_DENSITY))
 
 
 @dataclass
@@ -81,10 +77,9 @@ class TrainingConfig:
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
             ("ssim-lambda", 0 <= self.ssim_lambda <= 1, "from 0 to 1"),
-            *((name, attrgetter(name.replace("-", "_"))(self) >= 0, "0 or more") for name in NOT_BELOW_0),
         ):
             if not fits:
-                value = attrgetter(name.replace("-", "_"))(self)
+                value = getattr(self, name.replace("-", "_"))
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"
