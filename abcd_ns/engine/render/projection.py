@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Literal
 
 import torch
@@ -139,12 +139,9 @@ def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) 
 
 
 @lru_cache
-def _options(
-    sh_degree: int, antialiased: bool, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
+def _options(sh_degree: int, antialiased: bool, dtype: torch.dtype, device: torch.device) -> list[Tensor]:
     degrees = [float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)]
-    as_row = partial(torch.tensor, dtype=dtype, device=device)
-    return as_row([float(antialiased)]), as_row(degrees)
+    return [torch.tensor(row, dtype=dtype, device=device) for row in ([float(antialiased)], degrees)]
 
 
 def check_degree(gaussians: Gaussians, sh_degree: int) -> None:
