@@ -5,19 +5,19 @@
 #include "projection.h"
 #include "threads.h"
 
-// camera: rows of [rotation | translation], fx, fy, near. sums: [n, 10]. table: [n, columns], of which 12 are
+// camera: View.numbers. sums: [n, 10]. table: [n, columns], of which 12 are
 // added to from `start` on. Gaussians of no weight are passed over.
 extern "C" void abcd_worth(int64_t n, const float* means, const float* scales, const float* quats,
                            const float* sums, const float* camera, int64_t axes, float share, float* table,
                            int64_t columns, int64_t start) {
   using projection::EPS, projection::TINY;
-  const float *c = camera, fx = c[12], fy = c[13], near = c[14];
+  const float *c = camera, fx = c[12], fy = c[13], near = c[21];
   parallel_ranges(n, 1 << 12, [=](int64_t begin, int64_t end) {
     for (int64_t k = begin; k < end; k++) {
       const float *s = sums + 10 * k, *p = means + 3 * k, *q = quats + 4 * k;
       if (!(s[0] > 0)) continue;
       float at[3], right[3], down[3], xx = EPS, xy = 0, yy = EPS;
-      for (int i = 0; i < 3; i++) at[i] = c[4 * i] * p[0] + c[4 * i + 1] * p[1] + c[4 * i + 2] * p[2] + c[4 * i + 3];
+      for (int i = 0; i < 3; i++) at[i] = c[3 * i] * p[0] + c[3 * i + 1] * p[1] + c[3 * i + 2] * p[2] + c[9 + i];
       const float z = std::fmax(at[2], near), slope_x = at[0] / z, slope_y = at[1] / z;
       const float per = 1 / std::sqrt(std::fmax(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], TINY));
       const float w = q[0] * per, x = q[1] * per, y = q[2] * per, v = q[3] * per;
@@ -28,7 +28,7 @@ extern "C" void abcd_worth(int64_t n, const float* means, const float* scales, c
         const float size = std::exp(scales[3 * k + axis]);
         float a[3];
         for (int i = 0; i < 3; i++)
-          a[i] = size * (c[4 * i] * turn[axis] + c[4 * i + 1] * turn[3 + axis] + c[4 * i + 2] * turn[6 + axis]);
+          a[i] = size * (c[3 * i] * turn[axis] + c[3 * i + 1] * turn[3 + axis] + c[3 * i + 2] * turn[6 + axis]);
         right[axis] = (a[0] - slope_x * a[2]) * fx / z, down[axis] = (a[1] - slope_y * a[2]) * fy / z;
         xx += right[axis] * right[axis], xy += right[axis] * down[axis], yy += down[axis] * down[axis];
       }

@@ -70,9 +70,8 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
     if WORTH not in growth:
         growth[WORTH] = means.new_zeros((len(means), COLUMNS))
     table, start = growth[WORTH], (BY_CHANNEL + BY_AXIS) * half_of(view.index)
-    camera = torch.cat((view.viewmat[:3].flatten(), view.K.diagonal()[:2])).detach().to(means.dtype)
+    camera = view.numbers.detach().to(means.dtype)
     if suits(means, table, picture.sums):
-        camera = torch.cat((camera, camera.new_full((1,), view.near)))
         given = means, gaussians.scales, gaussians.quats, picture.sums, camera
         given = [each.contiguous() for each in given]  # held while their addresses are in use
         into = address(table)
@@ -85,13 +84,13 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
 
 
 def _asked(
-    gaussians: Gaussians, axes: int, picture: Judged, camera: Float[Tensor, "14"]
+    gaussians: Gaussians, axes: int, picture: Judged, camera: Float[Tensor, "22"]
 ) -> Float[Tensor, "n 12"]:
     """b and A of one picture."""
     means = gaussians.means
-    pose, focal = upload(camera, means.device).split((12, 2))
-    turn, shift = pose.view(3, 4).split((3, 1), dim=1)
-    x, y, z = (means @ turn.T + shift.T).T[..., None].unbind(0)
+    turn, shift, focal = upload(camera, means.device)[:14].split((9, 3, 2))
+    turn = turn.view(3, 3)
+    x, y, z = (means @ turn.T + shift).T[..., None].unbind(0)
     z = z.clamp_min(picture.view.near)
     axis = normalized_quat_to_rotmat(F.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
     along_x, along_y, along_z = (turn @ axis).unbind(1)  # a standard deviation of each axis, [n, 3]
