@@ -207,8 +207,7 @@ class LayerRenderer:
     ) -> Iterator[FrozenLayers]:
         crops = [loaded.crops[one.view.index] for one in seen]
         rays = [one.rays.on(self.rasterizer.window_grid(crop)) for one, crop in zip(seen, crops, strict=True)]
-        with torch.no_grad():
-            spans = ray_intervals(self.tree.box(node), rays)
+        spans = ray_intervals(self.tree.box(node), rays)
         shots = [
             CutShot(one.view, crop, *span.cut_by(one.window.on(span.grid)))
             for one, crop, span in zip(seen, crops, spans, strict=True)
@@ -237,13 +236,9 @@ class LayerRenderer:
         window = self.span(node, view, view.full) if is_cut else None
         return self.rasterizer.draw(gaussians, [Shot(view, view.full, None, window)], **vars(settings))[0]
 
-    @torch.no_grad()
     def span(self, node: int, view: View, crop: Crop) -> ZWindow:
         """Where the rays through the crop's tiles are inside a node."""
-        grid = self.rasterizer.window_grid(crop)
-        if node == 0:
-            return ZWindow.everything(grid, self.device, view.viewmat.dtype)
-        return ray_interval(self.tree.box(node), view, grid, self.device)
+        return ray_interval(self.tree.box(node), view, self.rasterizer.window_grid(crop), self.device)
 
     @torch.no_grad()
     def order(self, nodes: Sequence[int], view: View) -> tuple[int, ...]:

@@ -128,13 +128,7 @@ class ZWindow:
         return front, other, ZWindow(self.grid, torch.maximum(self.near, other.far), self.far)
 
     def on(self, grid: TileGrid) -> "ZWindow":
-        """The same window on the tiles of a crop of this crop.
-
-        Raises:
-            ValueError: the grid's tiles are none of these.
-        """
-        if grid == self.grid:
-            return self
+        """The same window on the tiles of a crop of this crop, see TileGrid.part."""
         return ZWindow(grid, self.grid.part(self.near, grid), self.grid.part(self.far, grid))
 
 

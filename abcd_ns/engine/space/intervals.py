@@ -69,11 +69,13 @@ class Rays:
         return Rays(self.center, grid, self.grid.part(self.directions, grid))
 
 
+@torch.no_grad()
 def ray_interval(box: Box, view: View, grid: TileGrid, device: torch.device | str = "cpu") -> ZWindow:
     """`ray_intervals` of one crop."""
     return ray_intervals(box, [Rays.of(view, grid, device)])[0]
 
 
+@torch.no_grad()
 def ray_intervals(box: Box, rays: Sequence[Rays]) -> list[ZWindow]:
     """The half-open intervals of camera z in which rays are inside `box`; all crops in one pass.
 
