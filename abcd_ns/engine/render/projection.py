@@ -133,9 +133,9 @@ def project_in_torch(
 def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) -> Float[Tensor, "c"]:
     """A view as `splat` takes it, in the dtype and on the device of `like`; one copy to the device."""
     learns = view.viewmat.requires_grad  # then each drawing has its own way back
-    size, center, near = (replace(view) if learns else view).numbers.tensor_split((18, 21))
-    antialiased, degrees = _options(sh_degree, antialiased, size.dtype, size.device)
-    return torch.cat((size, antialiased, center, near, degrees)).to(like)
+    pinhole, center, near = (replace(view) if learns else view).numbers.tensor_split((18, 21))
+    compensates, degrees = _options(sh_degree, antialiased, near.dtype, near.device)
+    return torch.cat((pinhole, compensates, center, near, degrees)).to(like)
 
 
 @lru_cache

@@ -170,6 +170,21 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index():
     assert swapped[10, 18, 1] > swapped[10, 18, 0]
 
 
+@BOTH
+def test_what_is_kept_of_a_camera_holds_no_gradient_back(draw):
+    """Not if it was first drawn in inference mode, nor if each of two drawings tells of its pose."""
+    gaussians, fixed = as_leaves(random_gaussians(12)), replace(VIEW)
+    with torch.inference_mode():
+        draw(gaussians, fixed, sh_degree=1)
+    moving = replace(VIEW, viewmat=VIEW.viewmat.clone().requires_grad_())
+    found = []
+    for view in (fixed, moving, moving):
+        draw(gaussians, view, sh_degree=1).color.sum().backward()
+        found.append(gaussians.means.grad.clone())
+    assert torch.allclose(found[0], found[2] / 3)
+    assert bool(moving.viewmat.grad.any())
+
+
 def test_clear_errors():
     gaussians = random_gaussians(3, sh_degree=1)
     with pytest.raises(ValueError, match="sh_degree is 2"):
