@@ -13,7 +13,7 @@ import tyro
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.config import TrainingConfig, check_not_below_0
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.schedule import DECAY_VIEWS
@@ -23,7 +23,6 @@ from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
 from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, UNUSED_OF_VIEWER, annotated, hidden, shown
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
-from abcd_ns.run.options import check_not_below_0
 
 MIRRORED = {
     "sh_degree": "sh_degree",

@@ -1,19 +1,14 @@
 """The options of a run, beside those of training itself."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Literal
 
 from abcd_ns.engine.space.partition import MAX_BLOCKS
-from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.config import TrainingConfig, check_not_below_0
 from abcd_ns.errors import UserError
 
-OF_DENSITY = ("max_gaussians", "min_contribution", "split_pixels", "refine_every")
-OF_TRAINING = ("batch", "point_pixels", "commit_seconds", *(f"density.{name}" for name in OF_DENSITY))
 NOT_BELOW_0 = ("blocks", "near_plane", "device_budget_gb", "gaussian_bytes", "ram_budget_gb", "workers")
-NOT_BELOW_0 += tuple(f"training.{name}" for name in OF_TRAINING)
 
 
 @dataclass
@@ -57,11 +52,3 @@ class RunOptions:
         if self.max_seconds is not None and not 0 < self.max_seconds < math.inf:
             raise UserError(f"--pipeline.max-seconds must be above 0 and finite, not {self.max_seconds}.")
         self.training.check()
-
-
-def check_not_below_0(options: object, names: Iterable[str]) -> None:
-    """Raise a UserError if a number, by its dotted name, is below 0 or not finite."""
-    for name in names:
-        if not 0 <= (value := attrgetter(name)(options)) < math.inf:
-            flag = name.replace("_", "-")
-            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")

@@ -1,6 +1,9 @@
 """How a scene is trained: every option of the engine, with its default."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal
 
 from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
@@ -10,6 +13,18 @@ from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
+
+_OF_DENSITY = ("max_gaussians", "min_contribution", "split_pixels", "refine_every")
+NOT_BELOW_0 = ("batch", "point_pixels", "commit_seconds", *(f"density.{name}" for name in _OF_DENSITY))
+
+
+def check_not_below_0(options: object, names: Iterable[str], within: str = "") -> None:
+    """Raise a UserError if a number, by its dotted name, is below 0 or not finite. The options are those
+    `within` --pipeline."""
+    for name in names:
+        if not 0 <= (value := attrgetter(name)(options)) < math.inf:
+            flag = f"--pipeline.{within}{name.replace('_', '-')}"
+            raise UserError(f"{flag} must be 0 or more and finite, not {value}.")
 
 
 @dataclass
@@ -71,6 +86,7 @@ class TrainingConfig:
 
     def check(self) -> None:
         """Look for options that are out of range or contradict each other; a UserError names the first."""
+        check_not_below_0(self, NOT_BELOW_0, "training.")
         recipe = self.recipe
         for name, fits, words in (
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
