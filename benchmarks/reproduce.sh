@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Trains what docs/results/README.md claims of scenes, one core a run.
+# Makes anew what docs/results/README.md claims, but for what a GPU said. One core a run.
 #
-#   DATA=FOLDER benchmarks/reproduce.sh            lists the rows and how long they take
+#   DATA=FOLDER benchmarks/reproduce.sh            lists the rows, and how long each and all take
 #   DATA=FOLDER benchmarks/reproduce.sh NAME ...   takes these, or all of a folder; `all` takes all
 #
 # FOLDER has the scenes. Needs a clean commit and an idle core. Stopped, the same command goes on. In the
@@ -12,40 +12,48 @@ export PATH="$PWD/.venv/bin:$PATH" OMP_NUM_THREADS=1
 small="castle-P30 fox caliterra bonsai"
 two_seeds="--seeds 0 1"
 
-rows() { # by the name, minutes, scene, reduction, then options of `abcd compare`
-    local row=$1 scene photos
+rows() { # by the name, minutes, then `abcd`'s command, with the scene's name for its folder
+    local row=$1 scene photos seed
     for scene in $small; do
-        $row splatfacto/$scene 25 $scene 4 --steps 4000 --methods abcd-monolithic splatfacto-scaled $two_seeds
+        trained splatfacto/$scene 25 $scene 4 --steps 4000 --methods abcd-monolithic splatfacto-scaled $two_seeds
     done
-    $row splatfacto/fox-shipped 40 fox 4 --steps 30000 --methods splatfacto --evals 15
-    $row splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
-    $row splatfacto/castle-P30-640-longer 20 castle-P30 1 --steps 9000 --methods abcd-monolithic
-    $row budgets/castle-P30 20 castle-P30 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
+    trained splatfacto/fox-shipped 40 fox 4 --steps 30000 --methods splatfacto --evals 15
+    trained splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
+    trained splatfacto/castle-P30-640-longer 20 castle-P30 1 --steps 9000 --methods abcd-monolithic
+    trained budgets/castle-P30 20 castle-P30 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
     for scene in fox caliterra bonsai; do
-        $row budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
+        trained budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
     done
-    $row budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
+    trained budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
     for scene in castle-P30 fox caliterra; do
-        $row equal-time/$scene 6 $scene 4 --seconds 60 --methods abcd-monolithic abcd --blocks 8 $two_seeds
+        trained equal-time/$scene 6 $scene 4 --seconds 60 --methods abcd-monolithic abcd --blocks 8 $two_seeds
     done
-    $row equal-time/bonsai-320 13 bonsai 2 --seconds 300 --methods abcd-monolithic abcd --blocks 8
-    $row equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
-    $row blocks/castle-P30 12 castle-P30 4 --seconds 180 --methods abcd --blocks 1 8 32
+    trained equal-time/bonsai-320 13 bonsai 2 --seconds 300 --methods abcd-monolithic abcd --blocks 8
+    trained equal-time/castle-P30-640 18 castle-P30 1 --seconds 420 --methods abcd-monolithic abcd --blocks 8
+    trained blocks/castle-P30 12 castle-P30 4 --seconds 180 --methods abcd --blocks 1 8 32
     for scene in castle-P30 caliterra fox; do
         for photos in 12 3; do
-            $row few/$scene-$photos 3 $scene-$photos 4 --steps 1500 --methods abcd-monolithic --seeds 0 1 2 \
+            trained few/$scene-$photos 3 $scene-$photos 4 --steps 1500 --methods abcd-monolithic --seeds 0 1 2 \
                 --vary training.recipe.dropout=0
         done
     done
-    $row coverage/land 12 land 1 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
-    $row coverage/caliterra 18 caliterra 4 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
-    $row gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
+    trained coverage/land 12 land 1 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
+    trained coverage/caliterra 18 caliterra 4 --steps 4000 --methods abcd-monolithic abcd --blocks 2 8 --seeds 0 1 2
+    trained gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
         --vary training.density.min-contribution={0,1,4,16,64}
-    $row peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
+    trained peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
+    $row memory 20 compare --tiles 2 8 32 64 512 --methods abcd abcd-monolithic
+    for seed in 0 1 2 3; do
+        $row stability/seed-$seed 2 stability --seed $seed
+    done
+}
+
+trained() { # on a scene, by its name, and a reduction of its photos
+    $row "$1" "$2" compare --data "$3" --downscale "$4" "${@:5}"
 }
 
 list() {
-    printf '%-26s %3d min   abcd compare --data %s --downscale %s %s\n' "$1" "$2" "$3" "$4" "${*:5}"
+    printf '%-26s %3d min   abcd %s\n' "$1" "$2" "${*:3}"
 }
 
 with_few_photos() { # of those that are not held out, evenly spaced: as many as the name ends with
@@ -60,26 +68,31 @@ with_few_photos() { # of those that are not held out, evenly spaced: as many as 
 }
 
 take() {
-    local name=$1 data=$DATA/$3 reduction=$4 pictures=0 wanted
-    [[ ! -f docs/results/$name.jpg ]] || pictures=1
+    local name=$1 words=("${@:3}") scene=${*:5:1} wanted
     for wanted in $asked; do
         [[ $wanted == all || $name == "$wanted" || $name == "$wanted"/* ]] || continue
-        [[ ! $3 =~ -(12|3)$ ]] || data=$(with_few_photos "$3")
-        abcd compare --data "$data" --downscale "$reduction" "${@:5}" --pictures $pictures --out "$out/$name"
+        if [[ $4 == --data ]]; then
+            words[2]=$DATA/$scene
+            [[ ! $scene =~ -(12|3)$ ]] || words[2]=$(with_few_photos "$scene")
+            words+=(--pictures "$([[ -f docs/results/$name.jpg ]] && echo 1 || echo 0)")
+        fi
+        abcd "${words[@]}" --out "$out/$name"
     done
 }
 
 collect() {
-    local found=$out/$1
+    local found=$out/$1 chart
     [[ ! -f $found/results.json ]] || install -D -m 644 "$found/results.json" "docs/results/$1.json"
-    [[ ! -f $found/memory_accuracy.png || ! -f docs/results/$1.png ]] ||
-        install -m 644 "$found/memory_accuracy.png" "docs/results/$1.png"
+    for chart in memory memory_accuracy; do # the second is of budgets only
+        [[ ! -f $found/$chart.png || ! -f docs/results/$1.png ]] ||
+            install -m 644 "$found/$chart.png" "docs/results/$1.png"
+    done
     [[ ! -d $found/pictures || ! -f docs/results/$1.jpg ]] || python -c 'import sys; from PIL import Image
 Image.open(sys.argv[1]).convert("RGB").save(sys.argv[2], quality=90)' "$found"/pictures/view-*.png "docs/results/$1.jpg"
 }
 
 if (($# == 0)); then
-    rows list
+    rows list | awk '{print; minutes += $2} END {printf "%.0f hours in all\n", minutes / 60}'
     exit
 fi
 : "${DATA:?is the folder with the scenes: DATA=FOLDER $0 $*}"

@@ -12,6 +12,7 @@ from pathlib import Path
 from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.results.results import SCHEMA, Arm, Results
 from abcd_ns.lab.results.tables import MEASURES, NOTHING, cell, markdown
+from abcd_ns.units import MIB
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "results" / "README.md"
 TABLE = re.compile(r"(?<=<!-- table: )(.+?) -->\n(?:\|.*\n)*(?=<!-- end -->)")
@@ -54,8 +55,11 @@ def _by_variant(results: Results) -> Iterator[tuple[str, dict[str, Arm]]]:
 
 def _in_words(arm: Arm) -> str:
     count = f", {arm.mean('blocks'):.0f} blocks" if arm.mean("blocks") > 1 else ""
-    scores = f"{cell(arm.runs, PSNR)} dB, {arm.mean('ssim_merged'):.3f}".replace(" 0.", " .")
-    return f"{scores}<br>{arm.mean('gaussians'):,.0f}{count}, {arm.mean('train_seconds'):.0f} s"
+    if arm.runs[0].memory is None:
+        found = f"{cell(arm.runs, PSNR)} dB, {arm.mean('ssim_merged'):.3f}".replace(" 0.", " .")
+    else:  # on a terrain nothing is held out
+        found = f"{arm.mean('peak_rss_bytes') / MIB:,.0f} MiB"
+    return f"{found}<br>{arm.mean('gaussians'):,.0f}{count}, {arm.mean('train_seconds'):.0f} s"
 
 
 if __name__ == "__main__":

@@ -142,10 +142,10 @@ def test_the_tables_of_the_results_are_made_of_stored_runs():
 def test_what_the_results_are_reproduced_by_is_understood():
     script = ROOT / "benchmarks" / "reproduce.sh"
     listed = subprocess.run([script], capture_output=True, text=True, check=True).stdout
-    commands = re.findall(r"abcd compare .*", listed)
+    commands = re.findall(r"abcd (?:compare|stability) .*", listed)
     assert len(commands) > 15
     for command in commands:
-        parse(command)
+        parse(f"{command} --out reproduced")
 
 
 def memory_table() -> str:

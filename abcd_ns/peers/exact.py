@@ -26,6 +26,7 @@ from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.base import SUMS
+from abcd_ns.engine.render.pictures import seen_behind
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import front_to_back
 from abcd_ns.engine.space.visibility import Optics
@@ -43,7 +44,6 @@ from abcd_ns.engine.train.step.batch import (
     Sample,
     background,
     part_to_draw,
-    seen_behind,
 )
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer

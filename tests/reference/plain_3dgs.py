@@ -6,8 +6,10 @@ import torch
 
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_under_trained
+from abcd_ns.engine.render.base import Surroundings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
+from abcd_ns.engine.render.pictures import lacking, pictures_of
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityControl
 from abcd_ns.engine.train.density.growing import Judged
@@ -34,18 +36,18 @@ def train_plain(
         raster = draw(active, view, sh_degree=degree, residual_sums=True)
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
-        picture = torch.addcmul(raster.color, raster.transmittance[..., None], background).clamp(0, 1)
+        (picture,) = pictures_of([raster], [Surroundings(None, None, background, 0.0)])
         pixels, windows = view.width * view.height, (view.width - 10) * (view.height - 10)
         loss = photometric_loss(picture, photos.images[row], full_pixels=pixels, full_windows=windows)
         for optimizer in adam.values():
             optimizer.zero_grad()
-        residual = (photos.images[row] - picture).detach()
-        raster.info["sums"].ask([torch.cat((residual, torch.ones_like(residual[..., :1])), dim=-1)])
+        residual, error = lacking(picture, photos.images[row], None)
+        raster.info["sums"].ask([residual])
         loss.backward()
         for optimizer in adam.values():
             optimizer.step()
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, refined=refined)
-        judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
+        judged = Judged(view, raster.info["sums"].values[0], error)
         judged = [judged] if density.asks(taken / steps, first=False) else []
         growth, refines = density.after_step(params, adam, growth, (raster.info,), judged, clock)
         refined = clock.steps if refines else refined

@@ -41,6 +41,9 @@ ARGUMENTS = {
     "members": [_POINTER] * 3,
     "deepen": [_POINTER] * 3,
     "photometric": [*[_POINTER] * 2, *[_LONG] * 2, *[_POINTER] * 3],
+    "between": [_LONG, *[_POINTER] * 2],
+    "between_back": [_LONG, *[_POINTER] * 2, _FLOAT, *[_POINTER] * 3],
+    "residual": [_LONG, *[_POINTER] * 4],
     "adam": [_LONG, *[_POINTER] * 4, *[_FLOAT] * 5],
     "worth": [_LONG, *[_POINTER] * 5, _LONG, _FLOAT, _POINTER, *[_LONG] * 2],
 }
@@ -88,6 +91,7 @@ def library() -> ctypes.CDLL | None:
     for name, arguments in ARGUMENTS.items():
         getattr(found, f"abcd_{name}").argtypes = arguments
     found.abcd_lists.restype = _POINTER
+    found.abcd_residual.restype = ctypes.c_double
     found.abcd_threads(threads_wanted())
     return found
 

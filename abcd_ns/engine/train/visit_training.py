@@ -10,7 +10,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace, active_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.render import Raster
-from abcd_ns.engine.render.cuda.drawn import pictures_of
+from abcd_ns.engine.render.pictures import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import DEFERRED
 from abcd_ns.engine.train import schedule

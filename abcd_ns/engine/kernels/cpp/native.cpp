@@ -2,6 +2,7 @@
 #include "lanes.h"
 //
 #include "adam.h"
+#include "between.h"
 #include "drawing.h"
 #include "photometric.h"
 #include "projection.h"

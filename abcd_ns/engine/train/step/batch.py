@@ -16,6 +16,7 @@ from abcd_ns.engine.layers.layer_renderer import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.base import ResidualSums, Surroundings
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.render.pictures import lacking
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.growing import Judged
@@ -109,14 +110,6 @@ class Sample:
         return found if self.share == 1 else found / self.share
 
 
-def seen_behind(
-    residual: Float[Tensor, "h w 3"], in_front: Float[Tensor, "h w"] | None
-) -> Float[Tensor, "h w 4"]:
-    """A picture's residual as ResidualSums take it, of what lies behind something of this transmittance."""
-    shows = torch.ones_like(residual[..., :1]) if in_front is None else in_front[..., None]
-    return torch.cat((residual * shows, shows), dim=-1)
-
-
 def _mean_of_squares(pixels: Float[Tensor, "_h _w c"], by: int) -> Float[Tensor, "h w c"]:
     return F.avg_pool2d(pixels.permute(2, 0, 1), by).permute(1, 2, 0)
 
@@ -183,12 +176,11 @@ class Residuals:
         self, rendered: Rendered, samples: Sequence[Sample], pictures: Pictures, photos: Pictures
     ) -> None:
         """Call before the backward pass, with what was rendered of these samples and the loss compares."""
-        residuals = [photo[..., :3] - picture for picture, photo in zip(pictures, photos, strict=True)]
         for info in (info for info in rendered.infos if "sums" in info):
             own = [place for place, raster in enumerate(rendered.rasters) if raster.info is info]
-            info["sums"].ask([seen_behind(residuals[place], samples[place].in_front) for place in own])
-            for k, place in enumerate(own):
-                error = residuals[place].square().sum(dim=-1).mean()
+            found = [lacking(pictures[place], photos[place], samples[place].in_front) for place in own]
+            info["sums"].ask([residual for residual, _ in found])
+            for k, (place, (_, error)) in enumerate(zip(own, found, strict=True)):
                 self._asked.append((info["sums"], k, samples[place].view, error, samples[place].share))
 
     def found(self) -> list[Judged]:
