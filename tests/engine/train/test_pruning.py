@@ -19,6 +19,7 @@ from abcd_ns.engine.train.density.pruning import (
     contributions,
     covered,
     floaters,
+    fog,
     risen,
     veils,
 )
@@ -157,6 +158,26 @@ def test_what_veils_a_camera_goes_so_that_a_file_shows_what_the_run_does(make, v
     assert len(scene) >= 100
     assert float((scene.means - near[0].center).norm(dim=1).min()) > 0.2
     assert float(veils(near, scene, rasterizer, antialiased=False).sum()) < 0.01 * near[0].full.pixels
+
+
+@pytest.mark.parametrize(("opacity", "stays"), [(-1.0, False), (3.0, True)])
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_what_is_faint_and_mostly_fog_goes(make, views, photos, blocks, opacity, stays):
+    """It stands nearer to a camera than all that photos are known to show, and fills much of the picture."""
+    views = [replace(view, nearest=1.5) for view in views]
+    spot = views[0].center + 0.4 * views[0].viewmat[2, :3]
+    mist = random_gaussians(1, seed=3, size=0.08)
+    mist = replace(mist, means=spot[None].clone(), opacities=torch.full((1, 1), opacity))
+    start = Gaussians.cat([random_gaussians(120, seed=1, size=0.12), mist])
+    (expected,) = weights(start, TorchRasterizer(), [Shot(views[0], views[0].full)])
+    found = fog(views, start, TorchRasterizer(), antialiased=False)
+    torch.testing.assert_close(found[-1], expected[-1])
+    assert float(found[-1]) > 0.1 * views[0].full.pixels
+    density = replace(STILL, min_contribution=1e-6)
+    coordinator = make(start=start, views=views, blocks=blocks, steps=60, density=density, batch=1)
+    train(coordinator, photos)
+    away = (whole_scene(coordinator).means - spot).norm(dim=1)
+    assert bool((away < 0.1).any()) == stays
 
 
 @pytest.mark.parametrize("many", [64, 2])

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from abcd_ns.engine.layers.surface import NEARER
 from abcd_ns.engine.render import Raster, Rasterizer, Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.space.visibility import widest_slant
@@ -36,6 +37,9 @@ FAINT, FAINTER = 0.1, 0.25
 SHOWN = 0.003
 """Share of what a Gaussian would fill if nothing hid it that it must. Photos say next to nothing of one that
 they show less of, and where nothing hides it, it may veil a picture."""
+FOG, SEEN_THROUGH = 0.5, 0.5
+"""Share of what a Gaussian fills that may be fog, see layers/surface.py, where its opacity is below the
+second. Photos agree on no surface there."""
 MOST_VIEWS = 64
 """As many of a block's views tell what would fill them."""
 LEAST_DET = 1e-12
@@ -108,17 +112,39 @@ def veils(
 ) -> Float[Tensor, "n"]:
     """Pixels that each Gaussian would fill of all views from before their near planes. A run draws nothing
     there; other viewers, which get only a file, do."""
+    ends = [(NEAR_PLANE, view.near) for view in views]
+    return _filled_within(views, ends, gaussians, rasterizer, antialiased)
+
+
+def fog(
+    views: Sequence[View], gaussians: Gaussians, rasterizer: Rasterizer, antialiased: bool
+) -> Float[Tensor, "n"]:
+    """Pixels that each Gaussian fills of all views from before what their photos are known to show, about."""
+    some = evenly(views, MOST_VIEWS)
+    ends = [(view.near, NEARER * view.nearest) for view in some]
+    return _filled_within(some, ends, gaussians, rasterizer, antialiased) * (len(views) / len(some))
+
+
+def _filled_within(
+    views: Sequence[View],
+    ends: Sequence[tuple[float, float]],
+    gaussians: Gaussians,
+    rasterizer: Rasterizer,
+    antialiased: bool,
+) -> Float[Tensor, "n"]:
+    """Pixels that each Gaussian fills of all views where its camera z is between these ends, with nothing
+    else drawn."""
     means, found = gaussians.means, gaussians.means.new_zeros(len(gaussians))
-    reach, centers = widest_slant(views) * max(view.near for view in views), centers_of(views)
+    reach, centers = widest_slant(views) * max(far for _, far in ends), centers_of(views)
     low, high = (end.cpu() for end in (means.amin(dim=0) - reach, means.amax(dim=0) + reach))
     within = ((low < centers) & (centers < high)).all(dim=1).tolist()
-    for view in compress(views, within):
+    for view, (near, far) in compress(zip(views, ends, strict=True), within):
         matrix = view.viewmat.to(means)
         z = means @ matrix[2, :3] + matrix[2, 3]
-        (near,) = torch.where((z > NEAR_PLANE) & (z < view.near))
-        if len(near):  # nothing else is before them
-            shot = Shot(replace(view, near=NEAR_PLANE), view.full)
-            found[near] += weights(gaussians[near], rasterizer, [shot], antialiased=antialiased)[0]
+        (which,) = torch.where((z > near) & (z < far))
+        if len(which):  # nothing else is before them
+            shot = Shot(replace(view, near=near), view.full)
+            found[which] += weights(gaussians[which], rasterizer, [shot], antialiased=antialiased)[0]
     return found
 
 

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.density import pruning
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, LATE_START, START, are_gone, lower
 from abcd_ns.engine.train.density.growing import Judged
-from abcd_ns.engine.train.density.pruning import SHOWN
+from abcd_ns.engine.train.density.pruning import FOG, SEEN_THROUGH, SHOWN
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, VisitKind
@@ -149,6 +149,8 @@ class ActiveBlock:
             trained_on = [run.views[view] for view in run.active.trained_on]
             least = pruning.veils(list(run.views.values()), *drawn)
             least = least.maximum(SHOWN * pruning.covered(trained_on, *drawn))
+            faint = torch.sigmoid(run.params["opacities"][:, 0]) < SEEN_THROUGH
+            least = least.maximum(torch.where(faint, pruning.fog(trained_on, *drawn) / FOG, 0.0))
         part = CUT_BY_MEMORY if run.config.limits.block_limit and run.scene.tree.num_blocks > 1 else 1.0
         self.growth = run.density.prune(run.params, run.optimizers, self.growth, run.share, least, part)
         run.health.count("pruned", before - len(self))
