@@ -42,7 +42,7 @@ rows() { # by the name, minutes, then `abcd`'s command, with the scene's name fo
     trained gaussians 6 castle-P30 4 --seconds 45 --methods abcd-monolithic \
         --vary training.density.min-contribution={0,1,4,16,64}
     trained peers/castle-P30-eighth 8 castle-P30 4 --steps 4000 --budgets 1/8 --methods abcd abcd-partition abcd-ablated
-    $row memory 20 compare --tiles 2 8 32 64 512 --methods abcd abcd-monolithic
+    $row memory 5 compare --tiles 2 8 32 64 512 --methods abcd abcd-monolithic
     for seed in 0 1 2 3; do
         $row stability/seed-$seed 2 stability --seed $seed
     done
