@@ -44,7 +44,7 @@ LOST = {1 / 4: 0.6, 1 / 8: 1.8, 1 / 16: 2.7}
 """dB below one block, by the share of its memory for Gaussians that a block has. The most of four scenes, 160
 px wide (docs/results/README.md)."""
 LAYERS_BY_STEPS = 0.15
-"""Time for layers by the time of steps. Runs of 8 blocks on a CPU take 3 to 7% for them, of 19 up to 39%."""
+"""Time for layers by the time of steps. Runs of 8 blocks on a CPU take 2 to 8% for them, of 19 up to 39%."""
 
 
 @dataclass(frozen=True)
