@@ -52,11 +52,13 @@ def pictures_of(
     rasters: Sequence[Raster], around: Sequence[Surroundings]
 ) -> tuple[Float[Tensor, "_h _w 3"], ...] | None:
     """Pictures of rasters, all of one `draw`, 0..1; None where no kernel can tell."""
+    if (found := drawn.pictures_of(rasters, around)) is not None:
+        return found
     layers = [layer for each in around for layer in (each.front, each.back) if layer is not None]
-    if suits(*(raster.color for raster in rasters), *(layer.color for layer in layers)):
-        given = zip(rasters, around, strict=True)
-        return tuple(_Between.apply(r.color, r.transmittance, r.depth, each) for r, each in given)
-    return drawn.pictures_of(rasters, around)
+    if not suits(*(raster.color for raster in rasters), *(layer.color for layer in layers)):
+        return None
+    given = zip(rasters, around, strict=True)
+    return tuple(_Between.apply(r.color, r.transmittance, r.depth, each) for r, each in given)
 
 
 def seen_behind(
