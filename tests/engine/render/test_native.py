@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
+from pytorch_msssim import ssim
 
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.kernels import native
@@ -119,6 +121,23 @@ def test_the_loss_is_that_of_torch(size):
         loss.backward()
         found.append((loss.detach().double(), rendered.grad.double()))
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_half_the_rows_of_windows_tell_the_loss_of_all(dtype):
+    noise = F.interpolate(torch.randn(1, 3, 12, 16, dtype=dtype), size=(72, 96), mode="bicubic")[0]
+    photo = torch.rand(72, 96, 3, dtype=dtype)
+    gradients = []
+    for ours in (True, False):
+        rendered = (0.8 * photo + 0.1 + 0.05 * noise.permute(1, 2, 0)).requires_grad_()
+        if ours:
+            loss = photometric_loss(rendered, photo, full_pixels=72 * 96, full_windows=62 * 86)
+        else:
+            one, other = (picture.permute(2, 0, 1)[None] for picture in (rendered, photo))
+            loss = 0.8 * (rendered - photo).abs().mean() + 0.2 * (1 - ssim(one, other, data_range=1))
+        loss.backward()
+        gradients.append(rendered.grad[10:-10])  # at the border some pixels are in no window
+    assert relative_error(*gradients) < 0.01
 
 
 @needs_compiler

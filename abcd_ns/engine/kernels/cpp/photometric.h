@@ -7,7 +7,8 @@
 #include "threads.h"
 
 namespace photometric {
-constexpr int TAPS = 11, REACH = TAPS - 1, MOMENTS = 5;
+constexpr int TAPS = 11, REACH = TAPS - 1, MOMENTS = 5, STRIDE = 2;
+constexpr int SPREAD = REACH / STRIDE;  // one less than the rows of windows that a row of pixels is in, at most
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
 struct Bell {
@@ -20,12 +21,26 @@ struct Bell {
 };
 static const Bell bell;
 
-// out[j] = sum over k of tap_k in[j + k step], j < count.
-static inline void slide(const float* in, int64_t step, int64_t count, float* __restrict out) {
+// Along a row of pixels [count], 3 channels each: out[j] = sum over k of tap_k in[j + 3 k].
+static inline void slide(const float* in, int64_t count, float* __restrict out) {
   const Bell b = bell;
   for (int64_t j = 0; j < count; j++) {
     float total = 0;
-    for (int k = 0; k < TAPS; k++) total += b.tap[k] * in[j + k * step];
+    for (int k = 0; k < TAPS; k++) total += b.tap[k] * in[j + 3 * k];
+    out[j] = total;
+  }
+}
+
+// What the rows of windows [SPREAD + 1, count] that hold row r of the pixels say of it; the bell is symmetric.
+static inline void gather(const float* in, int64_t r, int64_t count, float* __restrict out) {
+  float tap[SPREAD + 1];
+  for (int k = 0; k <= SPREAD; k++) {
+    const int64_t at = r % STRIDE + STRIDE * k;
+    tap[k] = at < TAPS ? bell.tap[at] : 0;
+  }
+  for (int64_t j = 0; j < count; j++) {
+    float total = 0;
+    for (int k = 0; k <= SPREAD; k++) total += tap[k] * in[j + (SPREAD - k) * count];
     out[j] = total;
   }
 }
@@ -73,36 +88,38 @@ static inline float dissimilarity(float* moments, int64_t count, int64_t wide, f
 }  // namespace photometric
 
 // Sums of |x - y| and of 1 - SSIM into sums[2], and the gradient of weights . sums by x. h, w >= 11.
+// Every other row of windows counts, for its share of all of them.
 extern "C" void abcd_photometric(const float* x, const float* y, int64_t h, int64_t w, const float* weights,
                                  double* sums, float* gradient) {
   using namespace photometric;
-  const int64_t row = 3 * w, inner = 3 * (w - REACH), windows = h - REACH;
-  // Derivatives by what windows see of a row, in zeros: each pixel is in TAPS rows of windows.
-  std::unique_ptr<float[]> spread(new float[(h + REACH) * 3 * row]);
-  std::memset(&spread[0], 0, REACH * 3 * row * sizeof(float));
-  std::memset(&spread[h * 3 * row], 0, REACH * 3 * row * sizeof(float));
+  const int64_t row = 3 * w, inner = 3 * (w - REACH), windows = (h - REACH + STRIDE - 1) / STRIDE;
+  const float share = float(h - REACH) / windows;
+  // Derivatives by what a row of windows sees, spread along it, between rows of zeros.
+  std::unique_ptr<float[]> spread(new float[(windows + 2 * SPREAD) * 3 * row]);
+  std::memset(&spread[0], 0, SPREAD * 3 * row * sizeof(float));
+  std::memset(&spread[(windows + SPREAD) * 3 * row], 0, SPREAD * 3 * row * sizeof(float));
   std::vector<float> unlike(windows), apart(h);
   parallel_ranges(windows, 4, [&](int64_t begin, int64_t end) {
     const int64_t wide = inner + 6 * REACH;  // a window's derivatives, in zeros
     std::vector<float> down(MOMENTS * row), moments(MOMENTS * inner), by(3 * wide);
     for (int64_t r = begin; r < end; r++) {
-      blur_down(x + r * row, y + r * row, row, down.data());
-      for (int m = 0; m < MOMENTS; m++) slide(&down[m * row], 3, inner, &moments[m * inner]);
+      blur_down(x + STRIDE * r * row, y + STRIDE * r * row, row, down.data());
+      for (int m = 0; m < MOMENTS; m++) slide(&down[m * row], inner, &moments[m * inner]);
       unlike[r] = dissimilarity(moments.data(), inner, wide, &by[3 * REACH]);
-      for (int m = 0; m < 3; m++) slide(&by[m * wide], 3, row, &spread[((r + REACH) * 3 + m) * row]);
+      for (int m = 0; m < 3; m++) slide(&by[m * wide], row, &spread[((r + SPREAD) * 3 + m) * row]);
     }
   });
   parallel_ranges(h, 4, [&](int64_t begin, int64_t end) {
     std::vector<float> by(3 * row);
     for (int64_t r = begin; r < end; r++) {
-      slide(&spread[r * 3 * row], 3 * row, 3 * row, by.data());  // the bell is symmetric
+      gather(&spread[r / STRIDE * 3 * row], r, 3 * row, by.data());
       const float *a = x + r * row, *b = y + r * row, *by_xx = &by[row], *by_xy = &by[2 * row];
       float *by_x = by.data(), *out = gradient + r * row;
 #pragma GCC ivdep
       for (int64_t j = 0; j < row; j++) {
         const float difference = a[j] - b[j];
         const float sign = float(difference > 0) - float(difference < 0);
-        out[j] = weights[0] * sign - weights[1] * (by_x[j] + 2 * a[j] * by_xx[j] + b[j] * by_xy[j]);
+        out[j] = weights[0] * sign - share * weights[1] * (by_x[j] + 2 * a[j] * by_xx[j] + b[j] * by_xy[j]);
         by_x[j] = std::fabs(difference);
       }
       apart[r] = sum(by_x, row);
@@ -110,5 +127,5 @@ extern "C" void abcd_photometric(const float* x, const float* y, int64_t h, int6
   });
   sums[0] = sums[1] = 0;
   for (float each : apart) sums[0] += each;
-  for (float each : unlike) sums[1] += each;
+  for (float each : unlike) sums[1] += share * each;
 }

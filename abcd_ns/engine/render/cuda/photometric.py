@@ -12,10 +12,10 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.kernels.photometric import C1, C2, REACH, SSIM_WINDOW, TAPS
+from abcd_ns.engine.kernels.photometric import C1, C2, REACH, SSIM_STRIDE, SSIM_WINDOW, TAPS
 
 BLOCK = 256
-SIZES = ("height", "width")
+SIZES = ("height", "lines", "width")
 """Arguments for whose values no kernel is compiled anew."""
 
 
@@ -53,16 +53,16 @@ def _moments_along_rows(
 
 @triton.jit(do_not_specialize=SIZES)
 def _dissimilarity_along_columns(
-    rows_ptr, taps_ptr, by_ptr, sum_ptr, scale, height, width,
-    C1: tl.constexpr, C2: tl.constexpr, WINDOW: tl.constexpr, BLOCK: tl.constexpr,
+    rows_ptr, taps_ptr, by_ptr, sum_ptr, scale, height, lines, width,
+    C1: tl.constexpr, C2: tl.constexpr, STRIDE: tl.constexpr, WINDOW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """[3 h-10 w-10] of what SSIM changes by with m_x, m_xx and m_xy each; `scale` (1 - SSIM) to the sum."""
+    """[3 lines w-10] of what SSIM changes by with m_x, m_xx and m_xy each; `scale` (1 - SSIM) to the sum."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    columns, lines = width - WINDOW + 1, height - WINDOW + 1
+    columns = width - WINDOW + 1
     count, above = 3 * lines * columns, 3 * height * columns
     mask = at < count
     channel, row, column = at // (lines * columns), at // columns % lines, at % columns
-    source = (channel * height + row) * columns + column
+    source = (channel * height + STRIDE * row) * columns + column
     m_x, m_y = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     m_xx, m_yy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     m_xy = tl.zeros((BLOCK,), tl.float32)
@@ -85,10 +85,10 @@ def _dissimilarity_along_columns(
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _back_along_rows(by_ptr, taps_ptr, out_ptr, height, width, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
-    """[9 h-10 w]: of each column, what the windows that hold it say."""
+def _back_along_rows(by_ptr, taps_ptr, out_ptr, lines, width, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
+    """[9 lines w]: of each column, what the windows that hold it say."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    columns, lines = width - WINDOW + 1, height - WINDOW + 1
+    columns = width - WINDOW + 1
     mask = at < 9 * lines * width
     line, column = at // width, at % width
     found = tl.zeros((BLOCK,), tl.float32)
@@ -101,20 +101,19 @@ def _back_along_rows(by_ptr, taps_ptr, out_ptr, height, width, WINDOW: tl.conste
 
 @triton.jit(do_not_specialize=SIZES)
 def _gradient_along_columns(
-    x_ptr, y_ptr, rows_ptr, taps_ptr, gradient_ptr, sum_ptr, by_pixel, by_window, height, width,
-    WINDOW: tl.constexpr, BLOCK: tl.constexpr,
+    x_ptr, y_ptr, rows_ptr, taps_ptr, gradient_ptr, sum_ptr, by_pixel, by_window, height, lines, width,
+    STRIDE: tl.constexpr, WINDOW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """[h w 3]: the gradient of the loss by x; `by_pixel` |x - y| to the sum."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    lines = height - WINDOW + 1
     mask, above = at < 3 * height * width, 3 * lines * width
     row, column, channel = at // (3 * width), at // 3 % width, at % 3
     by_x = tl.zeros((BLOCK,), tl.float32)
     by_xx = tl.zeros((BLOCK,), tl.float32)
     by_xy = tl.zeros((BLOCK,), tl.float32)
     for k in range(WINDOW):
-        window = row - k
-        inside = mask & (window >= 0) & (window < lines)
+        window = (row - k) // STRIDE
+        inside = mask & (row >= k) & ((row - k) % STRIDE == 0) & (window < lines)
         tap, here = tl.load(taps_ptr + k), rows_ptr + (channel * lines + window) * width + column
         by_x += tap * tl.load(here, mask=inside, other=0.0)
         by_xx += tap * tl.load(here + above, mask=inside, other=0.0)
@@ -144,22 +143,25 @@ def photometric(
     """
     height, width = rendered.shape[:2]
     rendered, photo, taps = rendered.contiguous(), photo.contiguous(), _taps(rendered.device)
-    columns, lines = width - REACH, height - REACH
+    columns, windows = width - REACH, height - REACH
+    lines = triton.cdiv(windows, SSIM_STRIDE)
+    by_window *= windows / lines
     loss, gradient = rendered.new_empty(()), torch.empty_like(rendered)
     sizes = (5, 3, height, columns), (9, lines, columns), (9, lines, width)
     moments, by_moment, rows = map(rendered.new_empty, sizes)
     options = {"WINDOW": SSIM_WINDOW, "BLOCK": BLOCK}
-    size = height, width
+    strided = options | {"STRIDE": SSIM_STRIDE}
 
     def over(count: int) -> tuple[int]:
         return (triton.cdiv(count, BLOCK),)
 
-    _moments_along_rows[over(moments[0].numel())](rendered, photo, taps, moments, loss, *size, **options)
+    pictures = rendered, photo
+    _moments_along_rows[over(moments[0].numel())](*pictures, taps, moments, loss, height, width, **options)
     _dissimilarity_along_columns[over(3 * lines * columns)](
-        moments, taps, by_moment, loss, by_window, *size, C1=C1, C2=C2, **options
+        moments, taps, by_moment, loss, by_window, height, lines, width, C1=C1, C2=C2, **strided
     )
-    _back_along_rows[over(rows.numel())](by_moment, taps, rows, *size, **options)
+    _back_along_rows[over(rows.numel())](by_moment, taps, rows, lines, width, **options)
     _gradient_along_columns[over(gradient.numel())](
-        rendered, photo, rows, taps, gradient, loss, by_pixel, by_window, *size, **options
+        *pictures, rows, taps, gradient, loss, by_pixel, by_window, height, lines, width, **strided
     )
     return loss, gradient
