@@ -20,9 +20,8 @@ rows() { # by the name, minutes, then `abcd`'s command, with the scene's name fo
     trained splatfacto/fox-shipped 40 fox 4 --steps 30000 --methods splatfacto --evals 15
     trained splatfacto/castle-P30-640 40 castle-P30 1 --steps 3000 --methods abcd-monolithic splatfacto-scaled
     trained splatfacto/castle-P30-640-longer 20 castle-P30 1 --steps 9000 --methods abcd-monolithic
-    trained budgets/castle-P30 20 castle-P30 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
-    for scene in fox caliterra bonsai; do
-        trained budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd
+    for scene in $small; do
+        trained budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
     done
     trained budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
     for scene in castle-P30 fox caliterra; do
