@@ -75,6 +75,13 @@ class BlockSplit:
 
 
 @dataclass(frozen=True)
+class CutAnew:
+    """Growth was over and the scene was cut into fewer blocks, numbered from 0 again."""
+
+    blocks: int
+
+
+@dataclass(frozen=True)
 class Repaired:
     """Something in the active block was wrong and was repaired."""
 
@@ -170,6 +177,7 @@ Event = (
     | VisitEnded
     | EpochEnded
     | BlockSplit
+    | CutAnew
     | Repaired
     | PhotosWanted
     | WorkersSeen

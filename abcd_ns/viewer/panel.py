@@ -177,7 +177,7 @@ class AbcdPanel(ViewerControl):
         if self._coordinator.config.recipe.exact:
             return [texts.BlockRow(b, texts.Status.ACTIVE) for b in blocks]
         state, active = self._coordinator.state, self._active()
-        psnrs = {visit.block: visit.psnr for visit in self._log.visits}
+        psnrs = {visit.block: visit.psnr for visit in self._log.visits[self._log.renumbered :]}
         counts = [None if state.active and state.active.is_whole else scene.count(b) for b in blocks]
         return [
             texts.BlockRow(b, texts.status_of(b, state, active), counts[b], psnrs.get(b), state.views.get(b))

@@ -11,6 +11,7 @@ from abcd_ns.lab.results.records import RecordError, decode
 from abcd_ns.nerfstudio.run.log_lines import (
     KINDS,
     SCHEMA,
+    CutAnewLine,
     EndLine,
     HeldOutLine,
     Line,
@@ -62,9 +63,15 @@ class Story:
         """In the whole scene, when last counted."""
         return (self.last(EndLine) or self.last(SampleLine) or self.last(TrainingLine)).gaussians
 
+    @property
+    def since_cut(self) -> "Story":
+        """What came since the scene was cut anew, if it was: blocks have other numbers since."""
+        last = max((row for row, line in enumerate(self.lines) if isinstance(line, CutAnewLine)), default=0)
+        return replace(self, lines=self.lines[last:])
+
     def of_block(self, block: int) -> tuple[VisitEndLine, ...]:
-        """The visits to one block that ended."""
-        return tuple(visit for visit in self.visits if visit.block == block)
+        """The visits to one block that ended, since blocks have had their numbers."""
+        return tuple(visit for visit in self.since_cut.visits if visit.block == block)
 
 
 def read_story(path: Path) -> Story:
@@ -77,8 +84,10 @@ def read_story(path: Path) -> Story:
     training = story.last(TrainingLine)
     if training is None:
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    visited = [visit.block for visit in (*story.of(VisitLine), *story.visits) if visit.block is not None]
-    return replace(story, blocks=max([training.blocks, *(block + 1 for block in visited)]))
+    lines = (*story.since_cut.of(VisitLine), *story.since_cut.visits)
+    visited = [line.block + 1 for line in lines if line.block is not None]
+    cut = story.last(CutAnewLine)
+    return replace(story, blocks=max([training.blocks if cut is None else cut.blocks, *visited]))
 
 
 def _read_line(text: bytes, where: str) -> Line:

@@ -94,13 +94,17 @@ def influence(
     blocks."""
     blocks = int(owner.max()) + 1 if len(owner) else 0
     found: Influence = {}
-    small = [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in views]
-    for shots in in_passes(gaussians, small):
+    for shots in in_passes(gaussians, small_views(views)):
         each = weights(gaussians, rasterizer, shots, antialiased=antialiased)
         sums = each.new_zeros(len(shots), blocks).index_add_(1, owner, each).tolist()
         for view, row in zip((shot.view for shot in shots), sums, strict=True):
             _put(found, view.index, [value / view.full.pixels for value in row])
     return found
+
+
+def small_views(views: Iterable[View]) -> list[View]:
+    """As large as influences are found in."""
+    return [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in views]
 
 
 def in_passes(gaussians: Gaussians, small: Sequence[View]) -> Iterator[list[Shot]]:

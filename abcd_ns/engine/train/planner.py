@@ -5,16 +5,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from statistics import median_high
 
+from abcd_ns.engine.events import CutAnew
 from abcd_ns.engine.gaussians.param_swap import Params, active_gaussians
 from abcd_ns.engine.layers.footprints import VisitGeometry, footprints
 from abcd_ns.engine.space.influence import overlaps, visible_blocks, worth_training
 from abcd_ns.engine.space.visibility import Frusta, Optics
 from abcd_ns.engine.store.commit import pending_without, with_pending
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.store.special_blocks import DEFERRED, WHOLE
 from abcd_ns.engine.train import schedule
+from abcd_ns.engine.train.density.splitting import cut_anew
+from abcd_ns.engine.train.memory import limits_at, parameter_bytes
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, BlockHealth, VisitKind
 from abcd_ns.engine.train.step.batch import Batch, Pictures
+from abcd_ns.engine.train.step.layer_source import influence_by_layers
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 
@@ -22,6 +27,8 @@ DOUBTED = 8
 """Views that hardly show a block, as far as known, of which a visit looks at the first that sees it."""
 MANY = 100
 """Of more views than that, only those that a visit uses are asked whether they see the block."""
+REFILLED = 0.85
+"""Share of its limit to which a block is filled anew: below FULL, so that a few migrants do not cut it."""
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many epochs."""
 
@@ -193,8 +200,29 @@ class Planner(Visits):
             shares.append(left / sum(map(_views_of, state.queue)))
         return min(shares)
 
+    def _cut_anew(self) -> None:
+        """Once growth has ended, cut the scene into fewer blocks where pruning has left room, if RAM holds
+        it. A BlocksBusyError while a block is in flight."""
+        run, config = self._run, self._config
+        limit, count = limits_at(config, config.sh_degree).block_limit, run.count()
+        if run.share < config.density.refine_stop or not config.recipe.migrate or not limit:
+            return
+        blocks = max(math.ceil(count / max(REFILLED * limit, 1.0)), 2)
+        of_each = 3 * parameter_bytes(config.sh_degree)  # with moments
+        if blocks >= run.blocks or 2 * of_each * count > self._scene.ram_bytes:
+            return
+        if run.state.in_flight:
+            raise BlocksBusyError
+        tree, updates = cut_anew(self._scene, blocks)
+        scene = MemoryScene(tree, Gaussians.cat([updates[block].gaussians for block in range(blocks)]))
+        run.state.renumber(blocks, influence_by_layers(run, scene))
+        run.persist(tree, updates, config.commit_seconds)
+        run.announce(CutAnew(blocks))
+
     def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
+        if self._run.state.views:
+            self._cut_anew()
         recipe, state, blocks = self._config.recipe, self._run.state, self._scene.tree.num_blocks
         if not state.views:
             views = {}

@@ -11,7 +11,7 @@ import msgspec
 
 from abcd_ns.engine.layers.footprints import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
-from abcd_ns.engine.store.special_blocks import BlockName, from_text
+from abcd_ns.engine.store.special_blocks import WHOLE, BlockName, from_text
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
@@ -197,6 +197,18 @@ class RunState:
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
             self.queue.insert(place + 1, self.queue[place]._replace(block=new))
+
+    def renumber(self, blocks: int, influence: Influence) -> None:
+        """The scene was cut anew into so many blocks, which nothing but their influence is known of. What was
+        repaired in the old ones counts as the warm-up's."""
+        old = [self.health.pop(block) for block in list(self.health) if block != WHOLE]
+        whole = self.health.setdefault(WHOLE, BlockHealth())
+        for name in ("gradients", "moments", "values", "oversized", "pruned"):
+            setattr(whole, name, sum(getattr(record, name) for record in (whole, *old)))
+        visits = min((record.visits for record in old), default=0)
+        self.health |= {block: BlockHealth(visits=visits) for block in range(blocks)}
+        self.influence, self.views = influence, {}
+        self.epoch += 1
 
     def to_json(self) -> dict[str, Any]:
         """As JSON, which shares nothing with this state; `from_json` gives an equal one."""

@@ -3,7 +3,15 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from abcd_ns.engine.events import EpochEnded, HeldOutScored, PrunedAtEnd, VisitBegan, VisitEnded, WorkerLost
+from abcd_ns.engine.events import (
+    CutAnew,
+    EpochEnded,
+    HeldOutScored,
+    PrunedAtEnd,
+    VisitBegan,
+    VisitEnded,
+    WorkerLost,
+)
 
 SCHEMA = 2  # raised whenever a line changes its form or meaning
 
@@ -74,6 +82,11 @@ class EpochEndLine(EpochEnded, Line):
 
 
 @dataclass(frozen=True)
+class CutAnewLine(CutAnew, Line):
+    """The scene was cut into fewer blocks."""
+
+
+@dataclass(frozen=True)
 class PrunedAtEndLine(PrunedAtEnd, Line):
     """The final pruning is over."""
 
@@ -117,6 +130,7 @@ KINDS: dict[str, type[Line]] = {
     "sample": SampleLine,
     "visit end": VisitEndLine,
     "epoch end": EpochEndLine,
+    "cut anew": CutAnewLine,
     "worker lost": WorkerLostLine,
     "worker": WorkerLine,
     "pruned at end": PrunedAtEndLine,
@@ -127,6 +141,7 @@ KINDS: dict[str, type[Line]] = {
 KIND_OF = {
     VisitBegan: "visit",
     EpochEnded: "epoch end",
+    CutAnew: "cut anew",
     WorkerLost: "worker lost",
     PrunedAtEnd: "pruned at end",
 }

@@ -19,7 +19,15 @@ from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
-from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA, Line, SampleLine, VisitEndLine
+from abcd_ns.nerfstudio.run.log_lines import (
+    KIND_OF,
+    KINDS,
+    SCHEMA,
+    CutAnewLine,
+    Line,
+    SampleLine,
+    VisitEndLine,
+)
 
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
@@ -36,6 +44,8 @@ class RunLog:
         self._path: Path | None = path
         self.visits: list[VisitEndLine] = []
         """Those that ended, of the whole run."""
+        self.renumbered = 0
+        """Of these, so many came before blocks got the numbers that they have."""
         self.curve: list[tuple[float, float]] = []
         """Seconds of training, and the mean PSNR of training crops since the point before, dB."""
         self._psnrs: list[float] = []
@@ -124,6 +134,8 @@ class RunLog:
     def _remember(self, line: Line) -> None:
         if isinstance(line, VisitEndLine):
             self.visits.append(line)
+        elif isinstance(line, CutAnewLine):
+            self.renumbered = len(self.visits)
         elif isinstance(line, SampleLine) and line.psnr is not None:
             self.curve.append((line.seconds, line.psnr))
 

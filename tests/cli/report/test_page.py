@@ -259,6 +259,15 @@ def test_blocks_that_were_cut_off_during_the_run_count(tmp_path):
     assert (alone.blocks, draw_progress(alone)) == (1, None)
 
 
+def test_a_scene_that_was_cut_anew_has_the_blocks_and_visits_since(tmp_path):
+    ended = {"layer_seconds": 1.0, "visit_seconds": 4.0}
+    since = [line("cut anew", 40, 16.0, blocks=2), line("visit end", 50, 20.0, visit=4, block=1, **ended)]
+    story = read_story(write_log(tmp_path / "log", [*log_lines(), *since]))
+    assert story.blocks == 2
+    assert [len(story.of_block(block)) for block in (0, 1)] == [0, 1]
+    assert len(story.visits) == 5
+
+
 def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_line(tmp_path):
     path = write_log(tmp_path / "log.jsonl", log_lines()[:6])
     whole = path.read_bytes()

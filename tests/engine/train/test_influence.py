@@ -11,6 +11,7 @@ from abcd_ns.engine.gaussians.initialize import cloud_from_points
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.step.layer_source import influence_by_layers
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.world.world import camera
@@ -192,6 +193,20 @@ def test_a_block_that_a_wall_hides_is_neither_read_nor_drawn(tmp_path, monkeypat
         assert all(float(off.mean()) < 5e-4 for off in off_from_merged(run, batch, rendered.pictures))
         run.end_visit()
     assert len(hidden) == 4
+
+
+def test_layers_tell_the_influence_that_one_drawing_of_the_scene_does(make, views):
+    coordinator = make(blocks=5, steps=1)
+    scene, run = coordinator.scene, coordinator.run
+    whole = whole_scene(coordinator)
+    wanted = influence(whole, scene.tree.assign(whole.means), views, run.rasterizer)
+    found = influence_by_layers(run, scene)
+    assert found.keys() == wanted.keys()
+    for block, shares in wanted.items():  # a Gaussian at a border is shared there by its fragments
+        assert sum(found[block].values()) == pytest.approx(sum(shares.values()), rel=0.1)
+    for view in views:  # what they leave of the light is the same
+        both = [sum(shares.get(view.index, 0.0) for shares in each.values()) for each in (found, wanted)]
+        assert both[0] == pytest.approx(both[1], rel=1e-3)
 
 
 def test_where_no_influence_is_known_no_view_is_doubtful(tmp_path):

@@ -1,16 +1,20 @@
 """Blocks that outgrow their limit are cut in two: nothing lost, bounded, resumable."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+import torch
 
-from abcd_ns.engine.events import BlockSplit, VisitBegan, VisitEnded
+from abcd_ns.engine.events import BlockSplit, CutAnew, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.special_blocks import DEFERRED
+from abcd_ns.engine.store.commit import with_pending
+from abcd_ns.engine.store.special_blocks import DEFERRED, PENDING, WHOLE
 from abcd_ns.engine.train.density import control
-from abcd_ns.engine.train.density.splitting import end_joint, split_full
+from abcd_ns.engine.train.density.splitting import cut_anew, end_joint, split_full
+from abcd_ns.engine.train.planner import REFILLED
 from abcd_ns.engine.train.recipe import FULL, Limits
 from abcd_ns.engine.train.run_state import BlockHealth, RunState, standing
 from abcd_ns.engine.train.schedule import VisitPlan
@@ -81,10 +85,12 @@ def test_a_run_never_has_a_larger_block_than_it_may(make, photos, monkeypatch):
     limit, blocks = 130, 2
     coordinator = make(blocks=blocks, steps=50, density=GROWING, block_limit=limit, warmup=0.0)
     cuts, begun = listen(coordinator, BlockSplit), listen(coordinator, VisitBegan, lambda event: event.block)
-    assert max(len(coordinator.params["means"]) for _ in steps_of(coordinator, photos)) <= limit
-    tree = coordinator.scene.tree
-    assert tree.num_blocks == blocks + len(cuts) > blocks
+    run = coordinator.run
+    sizes = [(len(run.params["means"]), run.blocks) for _ in steps_of(coordinator, photos)]
+    assert max(gaussians for gaussians, _ in sizes) <= limit
+    assert max(count for _, count in sizes) == blocks + len(cuts) > blocks
     assert cuts[0].new in begun
+    tree = coordinator.scene.tree
     assert coordinator.scene.store.header["tree"] == tree.to_json()
     for block in range(tree.num_blocks):
         means = coordinator.scene.stored_with_pending(block).means
@@ -110,6 +116,65 @@ def test_a_run_that_was_cut_resumes_bit_for_bit(make, photos):
     while first.scene.tree.num_blocks == 2 or first.state.active is None:
         train_step(first, photos)
     whole, resumed = assert_resumes(make, photos, first.state.step + 3, **options)
+    assert whole.scene.tree == resumed.scene.tree
+
+
+CUT_ANEW = {"blocks": 6, "steps": 60, "density": STILL, "block_limit": 30, "warmup": 0.0}
+
+
+def test_once_growth_is_over_blocks_that_are_not_full_become_fewer(make, photos, start):
+    coordinator, blocks = make(**CUT_ANEW), math.ceil(len(start) / (REFILLED * CUT_ANEW["block_limit"]))
+    cuts, begun = listen(coordinator, CutAnew), listen(coordinator, VisitBegan)
+    counts = {(coordinator.run.share < 0.5, coordinator.run.blocks) for _ in steps_of(coordinator, photos)}
+    assert cuts == [CutAnew(blocks)]
+    assert counts >= {(True, 6), (False, blocks)}
+    assert (True, blocks) not in counts
+    assert {event.block for event in begun[-blocks:]} == set(range(blocks))
+    assert max(event.gaussians for event in begun[-blocks:]) <= FULL * CUT_ANEW["block_limit"]
+    assert len(whole_scene(coordinator)) == len(start)
+    assert sum(map(coordinator.scene.store.counts, range(6))) <= len(start)  # none is stored twice
+
+
+def test_a_scene_that_is_cut_anew_keeps_moments_and_pending_migrants(make, photos):
+    coordinator = make(blocks=4, steps=40, density=STILL, warmup=0.0)
+    train(coordinator, photos)
+    scene, first = coordinator.scene, coordinator.scene.state(0)
+    migrants = {0: first[3:], PENDING: replace(first[:3], clocks=Clocks())}
+    scene.persist(scene.tree, migrants, coordinator.state.to_json())
+    all_rows = [with_pending(scene, block) for block in range(4)]
+    tree, updates = cut_anew(scene, 2)
+    assert tree.num_blocks == 2
+    assert updates.keys() == {0, 1, 2, 3, PENDING}
+    assert [len(updates[name]) for name in (2, 3, PENDING)] == [0, 0, 0]
+    for parts in (lambda state: state.gaussians, lambda state: state.exp_avg):
+        before, after = (
+            torch.cat([parts(state).means for state in states]) for states in (all_rows, updates.values())
+        )
+        assert sorted(map(tuple, before.tolist())) == sorted(map(tuple, after.tolist()))
+    for block in (0, 1):
+        assert bool((tree.assign(updates[block].gaussians.means) == block).all())
+        assert updates[block].clocks in [state.clocks for state in all_rows]
+
+
+def test_what_was_repaired_in_blocks_that_are_no_more_is_still_told():
+    state = RunState(views={0: 3, 1: 4, 2: 1}, epoch=4)
+    state.health = {
+        WHOLE: BlockHealth(pruned=1),
+        0: BlockHealth(visits=3, pruned=7),
+        2: BlockHealth(visits=2),
+    }
+    state.renumber(2, {0: {5: 0.5}})
+    assert state.health[WHOLE].pruned == 8
+    assert state.health[1] == BlockHealth(visits=2)
+    assert (state.epoch, state.views, state.influence) == (5, {}, {0: {5: 0.5}})
+    assert state.health.keys() == {WHOLE, 0, 1}
+
+
+def test_a_run_that_was_cut_anew_resumes_bit_for_bit(make, photos):
+    first = make("first", **CUT_ANEW)
+    while first.scene.tree.num_blocks == 6 or first.state.active is None:
+        train_step(first, photos)
+    whole, resumed = assert_resumes(make, photos, first.state.step + 3, **CUT_ANEW)
     assert whole.scene.tree == resumed.scene.tree
 
 

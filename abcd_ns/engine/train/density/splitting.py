@@ -1,10 +1,13 @@
-"""Blocks that outgrow what the device holds are cut in two when they are persisted."""
+"""Blocks that outgrow what the device holds are cut in two when they are persisted. After growth the scene is
+cut anew, as pruning has left them half empty."""
 
-from abcd_ns.engine.gaussians.block_state import BlockState, join
-from abcd_ns.engine.space.partition import best_split
+from dataclasses import replace
+
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
+from abcd_ns.engine.space.partition import best_split, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.coarse_model import split_by_block
-from abcd_ns.engine.store.commit import without
+from abcd_ns.engine.store.commit import with_pending, without
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import ACTIVE, PENDING, BlockName
 from abcd_ns.engine.train.recipe import Limits
@@ -68,6 +71,23 @@ def cut_full(
     for new, parent in parents.items():
         state.inherit(new, parent)
     return tree, updates, parents
+
+
+def cut_anew(scene: StoredScene, blocks: int) -> tuple[BlockTree, dict[BlockName, BlockState]]:
+    """A tree of so many blocks with equal numbers of Gaussians, and everything to persist; blocks beyond them
+    are empty. All get the clocks of the old block that was trained on the median number of views."""
+    old = [with_pending(scene, block) for block in range(scene.tree.num_blocks)]
+    clocks = sorted((state.clocks for state in old), key=lambda clocks: clocks.adam_views)[len(old) // 2]
+    whole = replace(join(old), clocks=clocks)
+    del old
+    tree = build_kd(whole.gaussians.means, blocks)
+    parts = split_by_block(whole, tree.assign(whole.gaussians.means))
+    updates: dict[BlockName, BlockState] = {
+        block: parts.get(block, whole.nobody) for block in range(scene.tree.num_blocks)
+    }
+    if scene.pending is not None:
+        updates[PENDING] = replace(scene.pending.nobody, clocks=Clocks())
+    return tree, updates
 
 
 def end_joint(scene: StoredScene, state: RunState, limits: Limits) -> None:

@@ -12,6 +12,7 @@ from abcd_ns.engine.layers.layer_renderer import PARTS_BYTES, LayerRenderer, Ren
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.space.influence import DIGITS, Influence, small_views
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.memory import free_bytes, needs_of
@@ -63,6 +64,23 @@ def layers_of_visit(
     for ready, _ in enumerate(layers.draw(wanted, tell), start=1):  # noqa: B007
         tell()
     return layers
+
+
+@torch.no_grad()
+def influence_by_layers(run: TrainingRun, scene: BlockScene) -> Influence:
+    """The influence of every block of a scene on the training views; the device holds a block at a time."""
+    options = {"ownership": "fragments", "pass_gaussians": 0, "device": run.device}
+    renderer = LayerRenderer(scene, run.rasterizer, **options)
+    settings, found = RenderSettings(0, run.config.antialiased), dict[int, dict[int, float]]()
+    for view in small_views(run.views.values()):
+        before: Tensor | float = 1.0
+        for node, gaussians in renderer.loaded_in_order(view):
+            behind = before * renderer.raster(node, gaussians, view, settings).transmittance
+            block, share = scene.tree.rows[node][-1], float((before - behind).sum()) / view.full.pixels
+            if block >= 0 and (share := round(share, DIGITS)):
+                found.setdefault(block, {})[view.index] = share
+            before = behind
+    return found
 
 
 class WholeViews:
