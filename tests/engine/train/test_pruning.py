@@ -229,10 +229,11 @@ def test_few_views_ask_for_less():
     assert [density.for_views(n).min_contribution for n in (5, 12, 25, 500)] == [1.6, 3.84, 8.0, 8.0]
 
 
-@pytest.mark.parametrize(("blocks", "asked"), [(4, 30.0), (1, 60.0)])
-def test_where_memory_cuts_the_scene_half_of_the_minimum_is_asked(make, photos, blocks, asked):
+@pytest.mark.parametrize(("blocks", "most", "asked"), [(4, 38, 30.0), (1, 1000, 60.0)])
+def test_where_memory_cuts_the_scene_half_of_the_minimum_is_asked(make, photos, blocks, most, asked):
+    """`most` leaves no room to cut the scene anew into fewer blocks."""
     left = []
-    for limit, minimum in ((1000, 60.0), (0, asked), (0, 90.0 - asked)):
+    for limit, minimum in ((most, 60.0), (0, asked), (0, 90.0 - asked)):
         options = {"block_limit": limit, "density": replace(STILL, min_contribution=minimum)}
         coordinator = make(f"{limit}-{minimum}", blocks=blocks, steps=80, **options)
         train(coordinator, photos)
