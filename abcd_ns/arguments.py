@@ -9,8 +9,7 @@ from abcd_ns.errors import UserError
 
 LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "pictures": 0, "max_gaussians": 0}
 """The least that a number may be, by option; 1 for those that are not here."""
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
-"""A switch."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]  # a switch
 Number = Annotated[int, tyro.conf.arg(metavar="N")]
 
 

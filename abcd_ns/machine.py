@@ -26,8 +26,7 @@ class Machine:
     """What decides how fast a run is."""
 
     cpu: str
-    cores: int
-    """That this process may use."""
+    cores: int  # that this process may use
     torch_threads: int
     ram_bytes: int
     gpu: str | None

@@ -7,8 +7,7 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import Progress
 
-APPEARS_AFTER = 2.0
-"""Seconds of work after which the bar appears."""
+APPEARS_AFTER = 2.0  # seconds of work after which the bar appears
 
 T = TypeVar("T")
 

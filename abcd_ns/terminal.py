@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-NAMED = 3
-"""Of a list, how many are named."""
+NAMED = 3  # of a list, how many are named
 
 
 def print_plain(text: str, console: Console, style: str | None = None) -> None:

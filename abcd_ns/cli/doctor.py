@@ -50,42 +50,31 @@ NMS = "torchvision::nms"  # in the error of a torchvision that was built for ano
 class Facts:
     """The machine and the environment. Where torch does not start, what it tells is left at its default."""
 
-    abcd_ns: str
-    """Version and commit, and Python's version."""
-    versions: dict[str, str | None]
-    """Of PACKAGES; None where one is not installed."""
-    ray: str | None
-    """Version of what several GPUs need; None where it is not installed."""
-    broken: dict[str, str]
-    """By module, the error that its import ends with."""
-    registered: bool
-    """Whether nerfstudio finds the methods of this package."""
+    abcd_ns: str  # version and commit, and Python's version
+    versions: dict[str, str | None]  # of PACKAGES; None where one is not installed
+    ray: str | None  # version of what several GPUs need; None where it is not installed
+    broken: dict[str, str]  # by module, the error that its import ends with
+    registered: bool  # whether nerfstudio finds the methods of this package
     has_ns_train: bool
     os: str
     ram_bytes: int
     ram_free_bytes: int
-    disk_free_bytes: int
-    """Where `ns-train`, called here, would write."""
-    driver: str | None
-    """Of an NVIDIA device, whether torch sees it or not."""
+    disk_free_bytes: int  # where `ns-train`, called here, would write
+    driver: str | None  # of an NVIDIA device, whether torch sees it or not
     cpu: str | None = None
     cores: int = 0
-    gpu: str | None = None
-    """Name, memory and capability of the device that training takes."""
+    gpu: str | None = None  # name, memory and capability of the device that training takes
     gpus: int = 0
     torch_cuda: str | None = None
-    folder: str | None = None
-    """Of the CPU rasterizer's library; None where torch or abcd_ns do not start."""
+    folder: str | None = None  # of the CPU rasterizer's library; None where torch or abcd_ns do not start
     built: bool = False
-    gsplat: str | None = None
-    """Its compiled extension."""
+    gsplat: str | None = None  # its compiled extension
     build_tools: dict[str, str | None] = field(default_factory=dict)
     """What compiles it: the version of nvcc, where the others are; None where one is missing."""
     difference: float | None = None
     """The largest relative one of the CPU rasterizer to the reference. Training checks gsplat's."""
     failed: str | None = None
-    lpips_missing: str | None = None
-    """Why LPIPS cannot be computed, if so."""
+    lpips_missing: str | None = None  # why LPIPS cannot be computed, if so
 
 
 def doctor(*, verbose: bool = False) -> int:

@@ -158,12 +158,9 @@ class Shown:
         self._tree = BlockTree.from_json(self.store.header["tree"])
         self.blocks = range(self._tree.num_blocks)
         self.antialiased: bool = self.store.header.get(MADE_FOR, {}).get("antialiased", False)
-        self._corners = torch.zeros(0, 3, dtype=torch.float64)
-        """The lowest and highest coordinates so far."""
-        self.widest = 0.0
-        """The largest standard deviation so far, in the units of the file."""
-        self.faint = 0
-        """Of those that were counted, how many no rasterizer draws."""
+        self._corners = torch.zeros(0, 3, dtype=torch.float64)  # the lowest and highest coordinates so far
+        self.widest = 0.0  # the largest standard deviation so far, in the units of the file
+        self.faint = 0  # of those that were counted, how many no rasterizer draws
 
     @cached_property
     def sh_degree(self) -> int:

@@ -22,14 +22,10 @@ WIDEST = 110  # columns at which text is wrapped at the latest
 class Finding:
     """One thing found."""
 
-    level: Level
-    """error: nothing can come of it. warning: it may go wrong. note: good to know."""
-    name: str
-    """Its heading in docs/troubleshooting.md; stable."""
-    what: str
-    """What was found and what follows from it."""
-    fix: str = ""
-    """What to do about it; empty where there is nothing to be done."""
+    level: Level  # error: nothing can come of it. warning: it may go wrong. note: good to know
+    name: str  # its heading in docs/troubleshooting.md; stable
+    what: str  # what was found and what follows from it
+    fix: str = ""  # what to do about it; empty where there is nothing to be done
 
 
 error, warning, note = (partial(Finding, level) for level in STYLES)

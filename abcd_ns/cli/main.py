@@ -24,8 +24,7 @@ class Command(NamedTuple):
     name: str
     target: str
     help: str
-    passes_on: bool = False
-    """Whether the function parses its words by itself."""
+    passes_on: bool = False  # whether the function parses its words by itself
 
     def load(self) -> Callable[..., int | None]:
         module, function = self.target.split(":")

@@ -45,11 +45,9 @@ class Task:
 
     photos: Path
     names: tuple[str, ...]
-    work: Path
-    """A folder for the database and models."""
+    work: Path  # a folder for the database and models
     lens: str
-    one_lens: bool
-    """Whether all photos were taken with one lens at one focal length."""
+    one_lens: bool  # whether all photos were taken with one lens at one focal length
     order: Order
     seed: int = 0
 

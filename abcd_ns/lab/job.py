@@ -35,20 +35,14 @@ def scene_name(path: str) -> str:
 class Settings:
     """What all runs on a scene share; runs that differ in any of these are not comparable."""
 
-    data: str
-    """The scene, as an absolute path."""
+    data: str  # the scene, as an absolute path
     downscale: int
-    blocks: int
-    """0 where each arm has its own."""
-    seconds: float | None
-    """Of training; None where the budget is in steps."""
+    blocks: int  # 0 where each arm has its own
+    seconds: float | None  # of training; None where the budget is in steps
     steps: int | None
-    evals: int
-    """Points of the curve of held-out PSNR over training time, the end included."""
-    pictures: int
-    """Held-out views that are shown."""
-    hold_out: HoldOut = "auto"
-    """See `AbcdDataParserConfig.eval_mode`."""
+    evals: int  # points of the curve of held-out PSNR over training time, the end included
+    pictures: int  # held-out views that are shown
+    hold_out: HoldOut = "auto"  # see `AbcdDataParserConfig.eval_mode`
 
     @property
     def scene(self) -> str:
@@ -69,12 +63,9 @@ class Settings:
 class TerrainSettings:
     """What all runs on a synthetic terrain share."""
 
-    gaussians: int
-    """In each tile."""
-    visits: int
-    """Budget of a run; in one block none."""
-    device_limit_bytes: int = 0
-    """GPU memory that may be taken, as if the card had no more; 0 for all of it."""
+    gaussians: int  # in each tile
+    visits: int  # budget of a run; in one block none
+    device_limit_bytes: int = 0  # GPU memory that may be taken, as if the card had no more; 0 for all of it
 
 
 @dataclass(frozen=True)
@@ -86,10 +77,8 @@ class Job:
     settings: Settings
     changes: tuple[str, ...] = ()
     """Options that are not the method's defaults, as `training.warmup=0`: under the pipeline's, dotted."""
-    worker = "abcd_ns.lab.runs.worker"
-    """The module that does it."""
-    scratch = ()
-    """Folders beside the job that are dropped when it is done."""
+    worker = "abcd_ns.lab.runs.worker"  # the module that does it
+    scratch = ()  # folders beside the job that are dropped when it is done
 
     @property
     def variant(self) -> str:
@@ -135,14 +124,12 @@ class TerrainJob(Job):
 class Plan:
     """All runs of an experiment."""
 
-    kind: str
-    """What the folder holds, in a few words; another kind needs another folder."""
+    kind: str  # what the folder holds, in a few words; another kind needs another folder
     settings: Settings | TerrainSettings
     out: Path
     jobs: tuple[Job, ...]
     """In the order in which they are made: seed by seed, so that one that is interrupted has every arm's
     first seed first."""
-    command: str
-    """The command line that makes the same."""
+    command: str  # the command line that makes the same
     scene: str | None = None
     """By what the data are known again; None for those of a terrain, or where nobody looked."""

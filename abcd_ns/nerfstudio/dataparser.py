@@ -66,8 +66,7 @@ class AbcdDataParser(DataParser):
         super().__init__(config)
         self.downscale_factor: int | None = None
         """nerfstudio sets 1 where a trained scene is viewed or exported: photos may then be absent."""
-        self.tells = True
-        """Whether what was noticed is printed when the scene is read."""
+        self.tells = True  # whether what was noticed is printed when the scene is read
         self._prepared: Prepared | None = None
 
     @property

@@ -29,18 +29,14 @@ SOME_MEANS = 1000  # of a file's Gaussians that are looked for among the points
 class Inspected:
     """What a run's memory and start depend on."""
 
-    train: int
-    """Views to train on."""
+    train: int  # views to train on
     held_out: int
-    size: tuple[int, int]
-    """Width and height of the largest photo as it is trained on, px."""
+    size: tuple[int, int]  # width and height of the largest photo as it is trained on, px
     points: int
-    factor: int
-    """By which the photos' width and height are divided."""
+    factor: int  # by which the photos' width and height are divided
     cloud: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), compare=False)
     """The points, in the run's frame, [n, 3]."""
-    to_run: Similarity | None = field(default=None, compare=False)
-    """From the frame of the photos' poses."""
+    to_run: Similarity | None = field(default=None, compare=False)  # from the frame of the photos' poses
     capture: DataparserOutputs | None = field(default=None, compare=False)
     """The photos to train on and their cameras."""
 

@@ -79,8 +79,7 @@ class AbcdPipeline(VanillaPipeline):
             super().__init__(config, *args, **kwargs)
             if (held_out := len(self.datamanager.eval_dataset)) < 2:  # as many as a path begins and ends at
                 check_held_out(sys.argv, held_out)
-        self.coordinator: Trainer | None = None
-        """Drives the training once it has begun."""
+        self.coordinator: Trainer | None = None  # drives the training once it has begun
         self._drawn: list[Rendered] = []
         self._view_seconds = self._scoring_seconds = 0.0
         data = self.datamanager.train_dataset

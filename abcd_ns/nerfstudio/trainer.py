@@ -177,11 +177,9 @@ class AbcdTrainer(Trainer):
 
     def __init__(self, config: AbcdTrainerConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
-        self.total_steps = config.max_num_iterations
-        """Steps of the whole run, those before a resume included."""
+        self.total_steps = config.max_num_iterations  # steps of the whole run, those before a resume included
         config.pipeline.training.seed = config.machine.seed
-        self.asked = flat_options(config)
-        """The options as given, by dotted name: `config` is changed later."""
+        self.asked = flat_options(config)  # the options as given, by dotted name: `config` is changed later
         self._signals = StopSignals()
 
     @property

@@ -28,25 +28,19 @@ MOST_POINTS = 20_000  # of more points, an evenly spaced choice is projected
 class Look:
     """What one decoded photo shows."""
 
-    brightness: float
-    """Mean luma, 0 to 1; 0 where it could not be decoded."""
-    orientation: int = 1
-    """EXIF orientation, 1 to 8."""
+    brightness: float  # mean luma, 0 to 1; 0 where it could not be decoded
+    orientation: int = 1  # EXIF orientation, 1 to 8
     alpha: bool = False
-    error: str | None = None
-    """Why it cannot be decoded, in the words of training."""
+    error: str | None = None  # why it cannot be decoded, in the words of training
 
 
 @dataclass(frozen=True)
 class Visibility:
     """Counts of points, scaled up where only some were projected. Occlusion is ignored."""
 
-    in_view: np.ndarray
-    """float64 [views]: points in each view's picture."""
-    in_none: int
-    """Points in no picture."""
-    behind_all: int
-    """Those of them that lie behind every camera."""
+    in_view: np.ndarray  # float64 [views]: points in each view's picture
+    in_none: int  # points in no picture
+    behind_all: int  # those of them that lie behind every camera
     depth: np.ndarray
     """float64 [views]: median camera z of the points in the picture, model units; NaN without any."""
 
@@ -56,15 +50,12 @@ class Survey:
     """A scene that can be read. Lists and rows are in the order of the photos' names."""
 
     prepared: Prepared
-    train: list[int]
-    """Rows of the views that are trained on."""
+    train: list[int]  # rows of the views that are trained on
     held_out: list[int]
-    near: float
-    """The near plane that training takes, in its own units."""
+    near: float  # the near plane that training takes, in its own units
     seen: Visibility
     looks: tuple[Look, ...]
-    copies: list[list[int]]
-    """Groups of rows with the same photo."""
+    copies: list[list[int]]  # groups of rows with the same photo
 
     @property
     def names(self) -> list[str]:

@@ -48,12 +48,9 @@ SPECK = 0.001  # clusters with fewer faces than this share of the largest one's 
 class Piece:
     """A part of the surface, or all of it."""
 
-    vertices: np.ndarray
-    """[n, 3], world units; those between two pieces are in both, bit for bit."""
-    colors: np.ndarray
-    """float32 [n, 3], 0..1."""
-    faces: np.ndarray
-    """int64 [m, 3]."""
+    vertices: np.ndarray  # [n, 3], world units; those between two pieces are in both, bit for bit
+    colors: np.ndarray  # float32 [n, 3], 0..1
+    faces: np.ndarray  # int64 [m, 3]
 
 
 NOTHING = Piece(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))

@@ -54,8 +54,7 @@ class Capture:
     points: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
     views: list[View]
-    factor: int = 1
-    """By which the photos were reduced."""
+    factor: int = 1  # by which the photos were reduced
 
 
 def read(data: Path, downscale: int | None, console: Console) -> Capture:
@@ -84,12 +83,9 @@ class Forecast:
     fit: Fit
     batch: int
     points_of_block: tuple[int, ...]
-    shares: dict[str, dict[str, int]]
-    """Bytes by place and by what takes them, see `shares_of`."""
-    free: dict[str, int]
-    """Bytes that may be taken there."""
-    seconds_per_step: float
-    """Measured with the initial points."""
+    shares: dict[str, dict[str, int]]  # bytes by place and by what takes them, see `shares_of`
+    free: dict[str, int]  # bytes that may be taken there
+    seconds_per_step: float  # measured with the initial points
 
     @property
     def hours(self) -> tuple[float, float]:

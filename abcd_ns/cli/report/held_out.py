@@ -27,13 +27,11 @@ class Shown:
     """A view with its pictures, as data URIs."""
 
     score: ViewScore
-    place: str
-    """Its rank among all views by PSNR, in words."""
+    place: str  # its rank among all views by PSNR, in words
     photo: str
     picture: str
     error: str
-    width: int
-    """Of the pictures in the page, px."""
+    width: int  # of the pictures in the page, px
     height: int
 
 
@@ -42,10 +40,8 @@ class HeldOut:
     """Scores and pictures of the held-out views."""
 
     scores: tuple[ViewScore, ...]
-    gap: str
-    """The ordering gap, or why there is none."""
-    shown: tuple[Shown, ...]
-    """From best to worst."""
+    gap: str  # the ordering gap, or why there is none
+    shown: tuple[Shown, ...]  # from best to worst
     fog: tuple[float, ...] = ()
     """Shares of the screen that fog takes in a few training views; see `engine/layers/surface.py`."""
 

@@ -38,10 +38,8 @@ class Checkpoint:
     """The newest that a run saved."""
 
     path: Path
-    step: int
-    """Optimisation steps taken."""
-    pipeline: dict[str, Any]
-    """The pipeline's state_dict."""
+    step: int  # optimisation steps taken
+    pipeline: dict[str, Any]  # the pipeline's state_dict
     tree: BlockTree
 
     @property
@@ -57,12 +55,10 @@ class RunFolder:
     path: Path
     settings: Settings
     story: Story
-    checkpoint: Checkpoint | None
-    """None where the run ended before its first."""
+    checkpoint: Checkpoint | None  # None where the run ended before its first
     state: RunState = field(default_factory=RunState)
     """Of the planner at the checkpoint, or else the last that was saved."""
-    photos: str | None = None
-    """Of MadeFor; None where that is not known."""
+    photos: str | None = None  # of MadeFor; None where that is not known
 
 
 def open_run(path: Path) -> RunFolder:

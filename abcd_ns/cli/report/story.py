@@ -29,8 +29,7 @@ class Story:
     """All of a log."""
 
     lines: tuple[Line, ...]
-    blocks: int
-    """Their number, as far as is known: one that is split off during a run has the next number."""
+    blocks: int  # their number, as far as is known: one that is split off during a run has the next number
 
     def of(self, kind: type[L]) -> tuple[L, ...]:
         return tuple(line for line in self.lines if isinstance(line, kind))

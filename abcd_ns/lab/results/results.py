@@ -19,11 +19,9 @@ TERRAIN = "comparison of sizes"  # the kind of results of `abcd compare --tiles`
 class CurvePoint:
     """Where a run stood at one moment."""
 
-    seconds: float
-    """Of training; evaluation does not count."""
+    seconds: float  # of training; evaluation does not count
     steps: int
-    psnr: float
-    """Mean over the held-out views, merged, dB."""
+    psnr: float  # mean over the held-out views, merged, dB
     gaussians: int | None = None
     """That were drawn, of the whole scene; None in results of versions that did not count them."""
 
@@ -32,13 +30,10 @@ class CurvePoint:
 class ViewScore:
     """One held-out view after training."""
 
-    row: int
-    """In the list of held-out views."""
-    name: str
-    """The photo's file name."""
+    row: int  # in the list of held-out views
+    name: str  # the photo's file name
     psnr: float
-    ssim: float | None
-    """None in files of older versions, where the picture is smaller than SSIM's window."""
+    ssim: float | None  # None in files of older versions, where the picture is smaller than SSIM's window
     lpips: float | None
     psnr_merged: float
     ssim_merged: float | None
@@ -53,40 +48,31 @@ class Run:
     seed: int
     blocks: int
     steps: int
-    train_seconds: float
-    """Of training, drawing layers included; evaluation, saving and warm-up not."""
-    total_seconds: float
-    """Of the process, from its start to the end of saving; evaluation not."""
+    train_seconds: float  # of training, drawing layers included; evaluation, saving and warm-up not
+    total_seconds: float  # of the process, from its start to the end of saving; evaluation not
     psnr: float
     """Composited, dB. Likewise `ssim` and `lpips`. With `abcd compare --tiles` nothing is held out: of the
     crops trained on, mean of the last visit's steps."""
     ssim: float | None
     lpips: float | None
-    lpips_reason: str | None
-    """Why `lpips` is None."""
+    lpips_reason: str | None  # why `lpips` is None
     psnr_merged: float | None
     """All Gaussians drawn at once, as every viewer does, dB. Likewise `ssim_merged`. None where nothing is
     held out."""
     ssim_merged: float | None
     ordering_gap_db: float | None
     """PSNR of the merged against the composited pictures, from the mean of the views' squared errors."""
-    ordering_gap_note: str | None
-    """Why `ordering_gap_db` is None."""
+    ordering_gap_note: str | None  # why `ordering_gap_db` is None
     gaussians: int
-    peak_device_bytes: int | None
-    """The most that torch held on the GPU until the end of training."""
-    peak_device_note: str | None
-    """Why `peak_device_bytes` is None."""
+    peak_device_bytes: int | None  # the most that torch held on the GPU until the end of training
+    peak_device_note: str | None  # why `peak_device_bytes` is None
     peak_rss_bytes: int
     """The most RAM that the process held until the end of training, the curve's evaluations included."""
-    store_bytes: int
-    """On disk: the stored blocks, with their optimiser state."""
-    layer_seconds: float
-    """Training time that went into drawing layers."""
+    store_bytes: int  # on disk: the stored blocks, with their optimiser state
+    layer_seconds: float  # training time that went into drawing layers
     curve: tuple[CurvePoint, ...]
     views: tuple[ViewScore, ...]
-    versions: Versions
-    """Of the run itself, which may be older than the file it is listed in."""
+    versions: Versions  # of the run itself, which may be older than the file it is listed in
     peak_reserved_bytes: int | None = None
     """The most that torch took from the GPU for what it held, likewise; None in results of versions that
     did not ask."""
@@ -103,23 +89,18 @@ class Run:
     """The most that Gaussians in training and all that is held for each of them took, or they and frozen ones
     that were drawn: by counts at each step, and `memory.DeviceNeeds`. Pictures and layers are apart. None in
     results of versions that did not count, and of methods that hold no block for longer than a drawing."""
-    memory: "Footing | None" = None
-    """What `abcd compare --tiles` asks beyond."""
+    memory: "Footing | None" = None  # what `abcd compare --tiles` asks beyond
 
 
 @dataclass(frozen=True)
 class Footing:
     """Where a run's memory and time began, and what a visit took."""
 
-    base_rss_bytes: int
-    """RAM before the scene was made: Python, torch and the kernels."""
+    base_rss_bytes: int  # RAM before the scene was made: Python, torch and the kernels
     make_seconds: float
-    plan_seconds: float
-    """Until the first visit began: which views see which block."""
-    visit_seconds: float | None
-    """Mean of the visits but the first, whose time holds `plan_seconds`."""
-    layer_seconds: float | None
-    """Of it, for layers."""
+    plan_seconds: float  # until the first visit began: which views see which block
+    visit_seconds: float | None  # mean of the visits but the first, whose time holds `plan_seconds`
+    layer_seconds: float | None  # of it, for layers
 
 
 @dataclass(frozen=True)
@@ -128,12 +109,9 @@ class Failure:
 
     method: str
     seed: int
-    reason: str
-    """The last line of its log."""
-    log: str
-    """Its log, relative to the results' folder."""
-    variant: str = "default"
-    """What was changed of the method's options."""
+    reason: str  # the last line of its log
+    log: str  # its log, relative to the results' folder
+    variant: str = "default"  # what was changed of the method's options
 
 
 @dataclass(frozen=True)
@@ -141,12 +119,9 @@ class Arm:
     """One method with one thing set, and its runs."""
 
     method: str
-    variant: str
-    """What is set: `blocks=4`, or "default"."""
-    value: int | None
-    """What it is set to, where that is a whole number."""
-    runs: tuple[Run, ...]
-    """One for each seed that did not fail."""
+    variant: str  # what is set: `blocks=4`, or "default"
+    value: int | None  # what it is set to, where that is a whole number
+    runs: tuple[Run, ...]  # one for each seed that did not fail
 
     @property
     def name(self) -> str:
@@ -176,19 +151,13 @@ class Outcome:
     """One way in which methods fail, and what came of it here."""
 
     id: str
-    fails: str
-    """What happens elsewhere."""
-    done: str
-    """What is done here to make it happen."""
-    rule: str
-    """What passes."""
+    fails: str  # what happens elsewhere
+    done: str  # what is done here to make it happen
+    rule: str  # what passes
     passed: bool
-    worse: bool
-    """Whether ABCD did worse than one block, whatever the rule says."""
-    said: dict[str, str]
-    """By method, what it did, in a few words."""
-    numbers: dict[str, float]
-    """What the rule was applied to, by name."""
+    worse: bool  # whether ABCD did worse than one block, whatever the rule says
+    said: dict[str, str]  # by method, what it did, in a few words
+    numbers: dict[str, float]  # what the rule was applied to, by name
     seconds: float
 
 
@@ -197,28 +166,22 @@ class Results:
     """The whole of results.json."""
 
     schema: int
-    kind: str
-    """Of the experiment: "comparison", "stability report"; older ones have "study of ..." too."""
-    date: str
-    """ISO 8601, UTC."""
-    command: str
-    """The command line that makes the same, without where its folders are."""
+    kind: str  # of the experiment: "comparison", "stability report"; older ones have "study of ..." too
+    date: str  # ISO 8601, UTC
+    command: str  # the command line that makes the same, without where its folders are
     machine: Machine
     versions: Versions
     settings: Settings | None = None
     """What all runs share, `data` being the name of the scene alone; None where nothing is held out."""
     seeds: tuple[int, ...] = ()
-    arms: tuple[Arm, ...] = ()
-    """Those with a run."""
+    arms: tuple[Arm, ...] = ()  # those with a run
     outcomes: tuple[Outcome, ...] = ()
     curves: tuple[dict[str, Any], ...] = ()
     """Of older stability reports: held-out PSNR against one thing each."""
     failures: tuple[Failure, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
-    findings: tuple[str, ...] = ()
-    """What the experiment says, a sentence each."""
-    notes: tuple[str, ...] = ()
-    """What a reader of the table has to know."""
+    findings: tuple[str, ...] = ()  # what the experiment says, a sentence each
+    notes: tuple[str, ...] = ()  # what a reader of the table has to know
 
     @property
     def means_of(self) -> str:

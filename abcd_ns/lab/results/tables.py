@@ -31,10 +31,8 @@ Rows = list[list[str]]  # of a table, its titles first
 class Measure:
     """One row or column."""
 
-    title: str
-    """With its unit."""
-    field: str
-    """Of `Run`; after a dot, of a part of it."""
+    title: str  # with its unit
+    field: str  # of `Run`; after a dot, of a part of it
     digits: int
     unit: int = 1
 

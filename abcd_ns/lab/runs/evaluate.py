@@ -26,12 +26,9 @@ class Drawn:
 
     row: int
     name: str
-    photo: Picture
-    """On the model's background where the file has an alpha channel."""
-    mask: Bool[Tensor, "h w 1"] | None
-    """Where it counts; None for everywhere."""
-    merged: Picture
-    """All Gaussians at once, as any viewer draws them."""
+    photo: Picture  # on the model's background where the file has an alpha channel
+    mask: Bool[Tensor, "h w 1"] | None  # where it counts; None for everywhere
+    merged: Picture  # all Gaussians at once, as any viewer draws them
     composited: Picture | None
     """Block by block. For a model without blocks both are the same picture; None where it was not drawn."""
 

@@ -43,14 +43,11 @@ class Stage:
     """What a capture gives: photos to train on, photos held out, points to begin with."""
 
     views: list[View]
-    photos: dict[int, Float[Tensor, "h w 3"]]
-    """By the view's index."""
+    photos: dict[int, Float[Tensor, "h w 3"]]  # by the view's index
     points: Float[Tensor, "n 3"]
-    colors: Float[Tensor, "n 3"]
-    """0..255."""
+    colors: Float[Tensor, "n 3"]  # 0..255
     held_out: list[View]
-    truth: list[Float[Tensor, "h w 3"]]
-    """Their photos."""
+    truth: list[Float[Tensor, "h w 3"]]  # their photos
 
     def __call__(self, index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         """The training loop's photo reader."""
@@ -90,10 +87,8 @@ def make_stage(
 class Trained(NamedTuple):
     """What a run left behind."""
 
-    gaussians: Gaussians
-    """The whole scene in one list."""
-    psnr: float
-    """Held-out, dB."""
+    gaussians: Gaussians  # the whole scene in one list
+    psnr: float  # held-out, dB
 
 
 class Lab:
@@ -156,14 +151,10 @@ class Lab:
 class Finding:
     """What a scenario found out."""
 
-    passed: bool
-    """By ABCD, under the scenario's rule."""
-    said: dict[str, str]
-    """By method, what it did, in a few words."""
-    numbers: dict[str, float] = field(default_factory=dict)
-    """What the rule was applied to, by name; finite."""
-    worse: bool = False
-    """Whether ABCD did worse than one block, whatever the rule says."""
+    passed: bool  # by ABCD, under the scenario's rule
+    said: dict[str, str]  # by method, what it did, in a few words
+    numbers: dict[str, float] = field(default_factory=dict)  # what the rule was applied to, by name; finite
+    worse: bool = False  # whether ABCD did worse than one block, whatever the rule says
 
 
 @dataclass(frozen=True)
@@ -171,10 +162,7 @@ class Scenario:
     """One way in which methods fail."""
 
     id: str
-    fails: str
-    """What happens elsewhere."""
-    done: str
-    """What is done here to make it happen."""
-    rule: str
-    """What passes."""
+    fails: str  # what happens elsewhere
+    done: str  # what is done here to make it happen
+    rule: str  # what passes
     run: Callable[[Lab], Finding]

@@ -30,8 +30,7 @@ class Land(World):
     """`tiles` of them, a power of 2, in rows as long as possible up to a square."""
 
     tiles: int
-    gaussians: int
-    """In each tile."""
+    gaussians: int  # in each tile
     seed: int = 0
 
     @property

@@ -26,8 +26,7 @@ class Ball:
 
     center: tuple[float, float, float]
     radius: float
-    fineness: float = 1.0
-    """How many times finer than usual its texture is."""
+    fineness: float = 1.0  # how many times finer than usual its texture is
 
     def meet(self, origin: Tensor, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """How far along each ray it is, in lengths of the direction; FAR where it is not."""
@@ -47,8 +46,7 @@ class Wall:
 
     axis: int
     at: float
-    half: float
-    """Half its side; it lies around the origin of the other two axes."""
+    half: float  # half its side; it lies around the origin of the other two axes
     fineness: float = 1.0
 
     def meet(self, origin: Tensor, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -61,12 +59,9 @@ class Wall:
 class Seen(NamedTuple):
     """What n rays see."""
 
-    places: Float[Tensor, "n 3"]
-    """Where they end, world; the origin of a ray that meets nothing."""
-    hit: Bool[Tensor, "n"]
-    """Whether anything near is there."""
-    colors: Float[Tensor, "n 3"]
-    """0..1."""
+    places: Float[Tensor, "n 3"]  # where they end, world; the origin of a ray that meets nothing
+    hit: Bool[Tensor, "n"]  # whether anything near is there
+    colors: Float[Tensor, "n 3"]  # 0..1
 
 
 class World(ABC):

@@ -20,10 +20,8 @@ SCHEMA = 2  # raised whenever a line changes its form or meaning
 class Line:
     """What all lines have."""
 
-    step: int
-    """Optimisation steps so far."""
-    seconds: float
-    """Of training so far."""
+    step: int  # optimisation steps so far
+    seconds: float  # of training so far
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,9 @@ class TrainingLine(Line):
     schema: int
     blocks: int
     gaussians: int
-    limit: int | None
-    """On the number of Gaussians in the scene."""
-    budgets: dict[str, int]
-    """Limits of what is kept in memory, bytes, by name."""
-    compiled_loss: bool = False
-    """Whether the loss runs in Triton's kernels."""
+    limit: int | None  # on the number of Gaussians in the scene
+    budgets: dict[str, int]  # limits of what is kept in memory, bytes, by name
+    compiled_loss: bool = False  # whether the loss runs in Triton's kernels
 
 
 @dataclass(frozen=True)
@@ -50,24 +45,18 @@ class VisitLine(VisitBegan, Line):
 class SampleLine(Line):
     """Where the run stands, every now and then."""
 
-    psnr: float | None
-    """Mean of training crops since the last sample, dB."""
-    gaussians: int
-    """In the whole scene."""
-    rss_bytes: int
-    """RAM of the process."""
-    device_bytes: int | None
-    """Of torch on the CUDA device; None without one."""
-    held: dict[str, int]
-    """Bytes in use of each budget."""
+    psnr: float | None  # mean of training crops since the last sample, dB
+    gaussians: int  # in the whole scene
+    rss_bytes: int  # RAM of the process
+    device_bytes: int | None  # of torch on the CUDA device; None without one
+    held: dict[str, int]  # bytes in use of each budget
 
 
 @dataclass(frozen=True)
 class VisitEndLine(VisitEnded, Line):
     """A visit ended and its block is persisted."""
 
-    psnr: float | None
-    """Mean of training crops in the visit's later half, dB."""
+    psnr: float | None  # mean of training crops in the visit's later half, dB
 
 
 def layer_share(visits: Iterable[VisitEndLine]) -> float:
@@ -103,16 +92,14 @@ class WorkerLine(Line):
     worker: int
     visits: int
     deaths: int
-    waited: float
-    """Share of its time without a block, 0..1."""
+    waited: float  # share of its time without a block, 0..1
 
 
 @dataclass(frozen=True)
 class HeldOutLine(HeldOutScored, Line):
     """Means over the held-out views."""
 
-    psnr: float | None
-    """dB; None where it is not finite."""
+    psnr: float | None  # dB; None where it is not finite
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,8 @@ class RunLog:
     def __init__(self, coordinator: Trainer, photos: Photos, path: Path, earlier: Path | None = None) -> None:
         self._coordinator, self._photos = coordinator, photos
         self._path: Path | None = path
-        self.visits: list[VisitEndLine] = []
-        """Those that ended, of the whole run."""
-        self.renumbered = 0
-        """Of these, so many came before blocks got the numbers that they have."""
+        self.visits: list[VisitEndLine] = []  # those that ended, of the whole run
+        self.renumbered = 0  # of these, so many came before blocks got the numbers that they have
         self.curve: list[tuple[float, float]] = []
         """Seconds of training, and the mean PSNR of training crops since the point before, dB."""
         self._psnrs: list[float] = []

@@ -32,20 +32,14 @@ class Settings:
 
     schema: int
     method: str
-    scene: str
-    """The name of the folder with the data."""
-    data: str
-    """The folder, as it was given."""
-    data_path: str
-    """Its absolute path."""
-    begun: datetime
-    """When training began: UTC."""
-    options: dict[str, Plain]
-    """Every option by its dotted name, as on `ns-train`'s command line."""
+    scene: str  # the name of the folder with the data
+    data: str  # the folder, as it was given
+    data_path: str  # its absolute path
+    begun: datetime  # when training began: UTC
+    options: dict[str, Plain]  # every option by its dotted name, as on `ns-train`'s command line
     versions: Versions
     machine: Machine
-    reader: str = OUR_READER
-    """What read the data: its name on `ns-train`'s command line."""
+    reader: str = OUR_READER  # what read the data: its name on `ns-train`'s command line
 
 
 def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Path) -> None:
