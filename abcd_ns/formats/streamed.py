@@ -29,7 +29,7 @@ COLOR = 4.0  # of a difference in colour against one in place, when pairs are ch
 MOST_OPAQUE = 0.99
 WIDER = 0.25
 """Of what would be more than opaque, as a power, how much makes a Gaussian wider. 1 keeps a wall as opaque
-as it was, but blurs captures: there 0.25 is best (docs/export.md)."""
+as it was, but blurs captures."""
 
 
 def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool = False) -> list[Path]:
