@@ -27,6 +27,7 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import Z_TO_Y
 from abcd_ns.formats.packed import BYTES_AT_ONCE, MOST_SOG, WIDEST_SPZ
+from abcd_ns.formats.ply import Content
 from abcd_ns.formats.scene_file import PACKED, rounding, shows, suffix_of, write_scene
 from abcd_ns.formats.streamed import write_streamed
 from abcd_ns.progress_bar import tracked
@@ -224,7 +225,8 @@ def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list
     up = Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
     parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
     with replacing(out) as partial:
-        write_scene(partial, suffix, sum(counts.values()), scene.sh_degree, up, parts, scene.antialiased)
+        content = Content(sum(counts.values()), scene.sh_degree, parts, scene.antialiased)
+        write_scene(partial, suffix, up, content)
         rounding(suffix, scene.largest)
     return [out]
 

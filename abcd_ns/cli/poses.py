@@ -23,7 +23,7 @@ from rich.progress import Progress
 
 from abcd_ns.data.colmap_model import CAMERA_MODELS
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import SUFFIXES, UNPOSED, UNREAD, check_complete, read_size, visible_files
+from abcd_ns.data.picture_files import SUFFIXES, UNPOSED, UNREAD, read_whole, visible_files
 from abcd_ns.errors import UserError, first_line
 from abcd_ns.terminal import few, print_plain
 
@@ -130,8 +130,7 @@ def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
     for path in found:
         with problems.collect():
             _check_name(path)
-            sizes.add(read_size(path))
-            check_complete(path)
+            sizes.add(read_whole(path))
     problems.raise_if_any()
     return tuple(str(path.relative_to(folder)) for path in found), sizes
 

@@ -62,39 +62,27 @@ class VisitOutcome:
         vars(self).update({**fields, "state": BlockState.unpacked(Packed(tensors, meta))})
 
 
-@dataclass(frozen=True)
+@dataclass
 class Assignment:
-    """A visit assigned to a worker. It ends when the worker answers, or is given up."""
+    """A visit that was begun and is not taken in yet. A worker has it if it was `submitted`."""
 
     number: int  # no other one of the run has it, so that late answers are known
     task: VisitTask
     state: Callable[[], BlockState]  # reads what the visit begins with, wherever the worker is
     drawn: Drawn  # likewise all blocks, this one too
+    taken: int  # Gaussians that waited for the block and are in its visit
+    ends: int  # views that each place for a visit has been given to draw when this one is to end
+    submitted: bool = False
+    losses: int = 0
+    outcome: VisitOutcome | None = None
 
 
-class StepsSeen(NamedTuple):
-    """A worker has taken steps; `psnr` is the last one's, dB."""
-
-    assignment: int
-    done: int
-    psnr: float
-
-
-class Finished(NamedTuple):
-    """A worker has answered."""
+class Report(NamedTuple):
+    """What is heard of an assignment."""
 
     assignment: int
-    outcome: VisitOutcome
-
-
-class Lost(NamedTuple):
-    """A worker is gone, or too long silent, and its visit with it."""
-
-    assignment: int
-    why: str
-
-
-Report = StepsSeen | Finished | Lost
+    said: tuple[int, float] | VisitOutcome | str
+    """Steps taken and the last one's PSNR, dB; or what became of the visit; or why the worker is lost."""
 
 
 @dataclass

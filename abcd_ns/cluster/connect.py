@@ -56,10 +56,9 @@ def keep_to_ourselves(starts: bool) -> None:
     if not starts:
         return
     if "ray" in sys.modules and os.environ.get(ON_LOOPBACK[0]) != ON_LOOPBACK[1]:
-        raise WorkersError(
-            "Ray was imported before workers were asked for, and would listen to strangers: set "
-            f"{'='.join(ON_LOOPBACK)} and RAY_AUTH_MODE=token in the environment."
-        )
+        fix = f"set {'='.join(ON_LOOPBACK)} and RAY_AUTH_MODE=token in the environment"
+        early = "Ray was imported before workers were asked for"
+        raise WorkersError(f"{early}, and would listen to strangers: {fix}.")
     os.environ["RAY_AUTH_MODE"] = "token"
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     os.environ.update([ON_LOOPBACK])

@@ -1,31 +1,21 @@
 """Trains blocks at once: assigns them to workers, and takes in what they made of them in a planned order.
 
 `lag` visits are in flight. They are taken in one after the other, as they would end if all steps took equally
-long, and whenever one is, the next begins from what is there by then. A worker that is done sooner waits. So
-a result depends on `lag`, not on timing or on lost workers: a visit that is done again gives the same. With a
-lag of 1 a run is the same as one by a coordinator alone.
+long, and whenever one is, the next begins from what is there by then. So a result depends on `lag`, not on
+timing or on lost workers. With a lag of 1 a run is the same as one by a coordinator alone.
 
 Blocks that are trained at once each make good their share of what is missing (`shared_residual`), in shorter
-visits. What it still costs was measured (docs/cluster.md).
+visits. docs/cluster.md says what it still costs.
 """
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from abcd_ns.cluster.assignment import (
-    Assignment,
-    Finished,
-    Lost,
-    StepsSeen,
-    VisitOutcome,
-    VisitTask,
-    Workers,
-    WorkersError,
-)
+from abcd_ns.cluster.assignment import Assignment, VisitOutcome, VisitTask, Workers, WorkersError
 from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import EpochEnded, StepTaken, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.commit import commit, with_pending
@@ -42,19 +32,6 @@ SECONDS = 0.5  # between two looks at the workers
 LOSSES = 5  # workers that a visit may lose before the run gives up: it is the visit that ends them
 
 
-@dataclass
-class InFlight:
-    """A visit that was begun and is not taken in yet."""
-
-    active: ActiveVisit
-    assignment: Assignment
-    taken: int  # Gaussians that waited for the block and are in its visit
-    ends: int  # views that each place for a visit has been given to draw when this one is to end
-    submitted: bool = False
-    losses: int = 0
-    outcome: VisitOutcome | None = None
-
-
 class Dispatcher(Coordinator):
     """Assigns blocks to workers; what cannot be assigned, the warm-up, it trains as a coordinator does. A
     `lag` of None is SLACK for each worker, and fewer where there are fewer blocks."""
@@ -69,12 +46,10 @@ class Dispatcher(Coordinator):
     ) -> None:
         super().__init__(run, room=room, target=target)
         self.workers, self._lag = workers, lag or SLACK * workers.count
-        self._in_flight: list[InFlight] = []
+        self._in_flight: list[Assignment] = []
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
         self._numbers, self._ended = itertools.count(1), 0
         self._counted = self.state.step
-
-    # -- a step, here or elsewhere -------------------------------------------------------------------
 
     @property
     def trains_elsewhere(self) -> bool:
@@ -111,8 +86,6 @@ class Dispatcher(Coordinator):
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         super().after_step(rendered, errors)
         self._counted = self.state.step
-
-    # -- assigning -----------------------------------------------------------------------------------
 
     def _assign(self) -> None:
         """Take in the visits that are due, and begin as many as workers can take."""
@@ -153,10 +126,9 @@ class Dispatcher(Coordinator):
         )
         state.active = None
         state.in_flight.append(active)
-        own = self.workers.share(with_pending(scene, block))
-        assignment = Assignment(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
+        own, drawn = self.workers.share(with_pending(scene, block)), {b: self._as_drawn(b) for b in blocks}
         taken, ends = len(scene.pending_for(block) or ()), self._ended + active.steps * max(active.batch, 1)
-        self._in_flight.append(InFlight(active, assignment, taken, ends))
+        self._in_flight.append(Assignment(next(self._numbers), task, own, drawn, taken, ends))
         self._submit()
         return True
 
@@ -170,7 +142,7 @@ class Dispatcher(Coordinator):
     def _beside(self, active: ActiveVisit) -> dict[int, float]:
         """By view, which part of the other blocks' weight is in flight meanwhile: begun before, or next."""
         state, block = self.state, active.geometry.block
-        others = {visit.active.geometry.block for visit in self._in_flight}
+        others = {visit.task.active.geometry.block for visit in self._in_flight}
         others |= {plan.block for plan in state.queue[: self._lag - 1]}
         blocks = self.scene.tree.num_blocks
         return shown_beside(state.influence, block, others - {block}, blocks, active.views)
@@ -180,46 +152,42 @@ class Dispatcher(Coordinator):
         limit = self.config.density.limit
         if limit is None:
             return None
-        given = sum(visit.assignment.task.allowance for visit in self._in_flight)
+        given = sum(visit.task.allowance for visit in self._in_flight)
         return max(limit - self.count() - given, 0) // max(self._lag - len(self._in_flight), 1)
 
     def _submit(self) -> None:
         for visit in self._in_flight:
             if not visit.submitted and self.workers.idle:
                 # It may have waited for long.
-                now = replace(visit.assignment.task, seconds=self.stopwatch.seconds)
-                visit.assignment = replace(visit.assignment, task=now)
-                self.workers.submit(visit.assignment)
-                visit.submitted, active, block = True, visit.active, visit.active.geometry.block
+                visit.task = task = replace(visit.task, seconds=self.stopwatch.seconds)
+                self.workers.submit(visit)
+                visit.submitted, active, block = True, task.active, task.active.geometry.block
                 if not visit.losses:
-                    seen, gaussians = len(active.trained_on), now.counts[block]
-                    self.announce(VisitBegan(active.number, now.epoch, block, active.steps, seen, gaussians))
-
-    # -- taking in -----------------------------------------------------------------------------------
+                    seen, gaussians = len(active.trained_on), task.counts[block]
+                    self.announce(VisitBegan(active.number, task.epoch, block, active.steps, seen, gaussians))
 
     def _listen(self) -> None:
         """Hear of workers, SECONDS at most."""
         for report in self.workers.wait(SECONDS):
-            visit = next((v for v in self._in_flight if v.assignment.number == report.assignment), None)
+            visit = next((v for v in self._in_flight if v.number == report.assignment), None)
             if visit is None or visit.outcome is not None:  # its assignment was given up
                 continue
-            match report:
-                case StepsSeen(_, done, psnr):
-                    self.announce(StepTaken(self.state.step, visit.active.number, done, psnr))
-                case Finished(_, outcome):
+            match report.said:
+                case (done, psnr):
+                    self.announce(StepTaken(self.state.step, visit.task.active.number, done, psnr))
+                case VisitOutcome() as outcome:
                     visit.outcome = outcome
-                case Lost(_, why):
+                case str(why):
                     self._lose(visit, why)
 
-    def _lose(self, visit: InFlight, why: str) -> None:
+    def _lose(self, visit: Assignment, why: str) -> None:
         visit.losses += 1
-        self.announce(WorkerLost(block := visit.active.geometry.block, why))
+        self.announce(WorkerLost(block := visit.task.active.geometry.block, why))
         if visit.losses >= LOSSES:
-            raise WorkersError(
-                f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. What other "
-                "visits did is safe: free memory (abcd plan says what a block needs) and resume."
-            )
-        visit.assignment, visit.submitted = replace(visit.assignment, number=next(self._numbers)), False
+            lost = f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}"
+            fix = "free memory (abcd plan says what a block needs) and resume"
+            raise WorkersError(f"{lost}. What other visits did is safe: {fix}.")
+        visit.number, visit.submitted = next(self._numbers), False
 
     def _take_in_first(self) -> bool:
         """Take in the visit that is to end first, if it is done; whether one was."""
@@ -228,8 +196,8 @@ class Dispatcher(Coordinator):
             return False
         self._in_flight.remove(visit)
         self._ended = visit.ends
-        outcome, active, state = visit.outcome, visit.active, self.state
-        block, epoch = active.geometry.block, visit.assignment.task.epoch
+        outcome, active, state = visit.outcome, visit.task.active, self.state
+        block, epoch = active.geometry.block, visit.task.epoch
         state.in_flight.remove(active)
         state.step += outcome.done
         if outcome.shown:
@@ -239,11 +207,9 @@ class Dispatcher(Coordinator):
         updates = commit(self.scene, block, outcome.state, self.config.recipe.migrate, visit.taken)
         self.persist_visit(active, outcome.state, updates, epoch)
         queued = state.epoch == epoch and state.queue
-        if not queued and all(other.assignment.task.epoch != epoch for other in self._in_flight):
+        if not queued and all(other.task.epoch != epoch for other in self._in_flight):
             self.announce(EpochEnded(epoch, state.step))
         return True
-
-    # -- persist and restore -------------------------------------------------------------------------
 
     def restore(self) -> None:
         """As the coordinator's; what workers are at is dropped, and planned again."""

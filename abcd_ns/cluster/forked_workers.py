@@ -20,17 +20,7 @@ from typing import NoReturn
 
 import torch
 
-from abcd_ns.cluster.assignment import (
-    Assignment,
-    Finished,
-    Lost,
-    Member,
-    Report,
-    StepsSeen,
-    VisitOutcome,
-    Workers,
-    WorkersError,
-)
+from abcd_ns.cluster.assignment import Assignment, Member, Report, VisitOutcome, Workers, WorkersError
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.kernels.native import share_cores
@@ -56,10 +46,8 @@ def last_words(error: Exception) -> WorkersError | MemoryError:
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{os.path.basename(place.filename)}:{place.lineno}, in {place.name}"
     what = traceback.format_exception_only(error)[-1].splitlines()[0]
-    return WorkersError(
-        f"A process that trains a block failed: {what} ({where}). What visits have finished is safe; "
-        "--pipeline.workers 1 trains in one process."
-    )
+    fix = "What visits have finished is safe; --pipeline.workers 1 trains in one process"
+    return WorkersError(f"A process that trains a block failed: {what} ({where}). {fix}.")
 
 
 @dataclass
@@ -68,7 +56,6 @@ class Place(Member):
 
     pipe: Connection | None = None
     heard: float = 0.0  # when it last said something, or was started
-    lives: bool = False  # whether it has said anything: from then on it ends when this process does
 
 
 class ForkedWorkers(Workers):
@@ -83,7 +70,7 @@ class ForkedWorkers(Workers):
     def submit(self, assignment: Assignment) -> None:
         member = self._longest_idle()
         member.take(assignment)
-        member.heard, member.lives = time.monotonic(), False
+        member.heard = time.monotonic()
         member.pipe, theirs = Pipe()
         member.pid = os.fork()
         if member.pid == 0:
@@ -91,15 +78,13 @@ class ForkedWorkers(Workers):
             visit, task = self._worker.visit, assignment.task
             _live(theirs, lambda tell: visit(task, assignment.state(), assignment.drawn, tell, self._clock))
         theirs.close()
+        member.pipe.poll(FIRST_WORD)  # from then on it ends when this process does
 
     def _clock(self) -> float:
         return time.perf_counter() - self._stood_still.value
 
     def hold(self) -> bool:
         if self._held_since is None:
-            for member in self._members:
-                if member.assignment and not member.lives:
-                    member.pipe.poll(FIRST_WORD)
             self._held_since = time.perf_counter()
             self._signal(signal.SIGSTOP)
         return True
@@ -120,7 +105,8 @@ class ForkedWorkers(Workers):
 
     def wait(self, seconds: float) -> list[Report]:
         busy = {member.pipe: member for member in self._members if member.assignment}
-        reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
+        heard = [self._hear(busy[pipe]) for pipe in wait(list(busy), seconds)]
+        reports = [report for report in heard if report is not None]
         for member in busy.values():
             if member.assignment and time.monotonic() - member.heard > SILENCE:
                 reports.append(self._lose(member, f"silent for {SILENCE:.0f} s"))
@@ -131,29 +117,29 @@ class ForkedWorkers(Workers):
             if member.assignment:
                 self._end(member)
 
-    def _hear(self, member: Place) -> list[Report]:
-        member.heard, member.lives = time.monotonic(), True
+    def _hear(self, member: Place) -> Report | None:
+        member.heard = time.monotonic()
         try:
             said = member.pipe.recv()
         except (OSError, EOFError):
-            return [self._lose(member, "it was killed")]
+            return self._lose(member, "it was killed")
         match said:
             case None:  # it lives
-                return []
-            case (int(done), float(psnr)):
+                return None
+            case (done, _):
                 member.done = done
-                return [StepsSeen(member.assignment.number, done, psnr)]
+                return Report(member.assignment.number, said)
             case VisitOutcome():
                 member.visits += 1
-                return [Finished(self._end(member).number, said)]
+                return Report(self._end(member).number, said)
             case MemoryError():
-                return [self._lose(member, str(said))]
+                return self._lose(member, str(said))
         self._end(member)
         raise said
 
-    def _lose(self, member: Place, why: str) -> Lost:
+    def _lose(self, member: Place, why: str) -> Report:
         member.deaths += 1
-        return Lost(self._end(member).number, why)
+        return Report(self._end(member).number, why)
 
     def _end(self, member: Place) -> Assignment:
         assignment = member.put_down()

@@ -20,11 +20,8 @@ from ray import exceptions as of_ray
 from abcd_ns import __version__
 from abcd_ns.cluster.assignment import (
     Assignment,
-    Finished,
-    Lost,
     Member,
     Report,
-    StepsSeen,
     VisitOutcome,
     VisitTask,
     Workers,
@@ -139,7 +136,7 @@ class RayWorkers(Workers):
             if ref == by_ref[ref].question:
                 reports += self._answer_of(by_ref[ref])
             elif ref == by_ref[ref].asked:
-                reports += self._end_of(by_ref[ref], ref)
+                reports += self._end_of(by_ref[ref])
         for member in self._members:
             patience = SILENCE if member.ready else SLOW_START
             waits = member.question is not None or not member.ready
@@ -170,17 +167,17 @@ class RayWorkers(Workers):
     def _answer_of(self, member: Remote) -> list[Report]:
         question, member.question = member.question, None
         try:
-            steps, psnr = ray.get(question, timeout=0)
+            progress = ray.get(question, timeout=0)
         except (of_ray.RayActorError, of_ray.GetTimeoutError):
             return []  # what it was asked to do fails likewise, and says why
         if member.assignment is None:
             return []
-        member.done = steps
-        return [StepsSeen(member.assignment.number, steps, psnr)]
+        member.done, _ = progress
+        return [Report(member.assignment.number, progress)]
 
-    def _end_of(self, member: Remote, ref: ray.ObjectRef) -> list[Report]:
+    def _end_of(self, member: Remote) -> list[Report]:
         try:
-            answer = ray.get(ref)
+            answer = ray.get(member.asked)
         except of_ray.RayTaskError as error:
             if is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
                 return self._replace(member, "out of memory")
@@ -193,19 +190,17 @@ class RayWorkers(Workers):
             member.since = member.since or member.free_since
             return []
         member.visits += 1
-        return [Finished(assignment.number, answer)]
+        return [Report(assignment.number, answer)]
 
     def _replace(self, member: Remote, why: str) -> list[Report]:
         """End one, if it is not gone, and start another in its place."""
         ray.kill(member.actor)
-        lost = [Lost(member.assignment.number, why)] if member.assignment else []
+        lost = [Report(member.assignment.number, why)] if member.assignment else []
         member.deaths += 1
         self._failed_starts += not member.ready
         if self._failed_starts >= STARTS:
-            raise WorkersError(
-                f"Workers end before they can begin, the last one so: {why}. Try with fewer workers; "
-                "abcd doctor looks at this machine."
-            )
+            fix = "Try with fewer workers; abcd doctor looks at this machine"
+            raise WorkersError(f"Workers end before they can begin, the last one so: {why}. {fix}.")
         self._start(member)
         return lost
 
@@ -215,10 +210,9 @@ def _version() -> str:
 
 
 def _no_room(error: Exception) -> WorkersError:
-    return WorkersError(
-        f"Ray has no room for a block: {first_line(error)}. Free the disk of Ray's folder (RAY_TMPDIR "
-        "says where), or start a cluster with a larger --object-store-memory."
-    )
+    free = "Free the disk of Ray's folder (RAY_TMPDIR says where)"
+    fix = f"{free}, or start a cluster with a larger --object-store-memory"
+    return WorkersError(f"Ray has no room for a block: {first_line(error)}. {fix}.")
 
 
 def _as_user_error(error: of_ray.RayTaskError, number: int) -> Exception:

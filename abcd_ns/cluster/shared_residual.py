@@ -30,12 +30,10 @@ FAINT = 0.01  # weight that a block is given in every pixel, so that shares exis
 ROOM = 10 / 26  # of that for layers, for pictures: 5 numbers a pixel, where F and B have 8
 
 
-def shares(
-    own: Float[Tensor, "h w"], all_of_them: Float[Tensor, "h w"], beside: float
-) -> Float[Tensor, "h w"]:
+def shares(own: Float[Tensor, "h w"], whole: Float[Tensor, "h w"], beside: float) -> Float[Tensor, "h w"]:
     """A block's share of each pixel's error, by w, w + o and q; see above."""
     own = own + FAINT
-    return own / (own + beside * (all_of_them + FAINT - own).clamp_min(0))
+    return own / (own + beside * (whole + FAINT - own).clamp_min(0))
 
 
 def shown_beside(

@@ -99,8 +99,7 @@ def _part(model: Path, name: str) -> Path | None:
 
 def _count_photos(model: Path) -> int:
     """How many a model says that it has; a line and one of 2D points for each, in text."""
-    path = _part(model, "images")
-    if path is None:
+    if (path := _part(model, "images")) is None:
         return 0
     if path.suffix == ".txt":
         return (sum(1 for _ in _lines(path, blank=True)) + 1) // 2
@@ -139,20 +138,19 @@ def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> n
     return rigid(Z_UP[:, :3] @ pose, label)
 
 
-def _lens(model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    """COLMAP's parameter list as a Lens; one focal length stands for both where there is only one."""
-    two_focals = model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
-    fx, fy, cx, cy = p[:4] if two_focals else (p[0], *p[:3])
-    distortion = p[4:] if two_focals else p[3:]
+def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+    if model not in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"):
+        params = (params[0], *params)  # one focal length stands for both
+    fx, fy, cx, cy, *distortion = params
     fisheye = model.endswith("FISHEYE")
-    padding = (0.0,) * ((4 if fisheye else 8) - len(distortion))
-    return Lens(width, height, fx, fy, cx, cy, tuple(distortion) + padding, fisheye)
+    padding = [0.0] * ((4 if fisheye else 8) - len(distortion))
+    return Lens(width, height, fx, fy, cx, cy, (*distortion, *padding), fisheye)
 
 
 def _unsupported(path: Path, number: int, model: object) -> InputError:
-    names = ", ".join(name for name, _ in CAMERA_MODELS.values())
+    known = ", ".join(name for name, _ in CAMERA_MODELS.values())
     fix = "undistort the scene with `colmap image_undistorter`"
-    return InputError(f"{path}: camera {number} has the model {model}, not one of {names}; {fix}.")
+    return InputError(f"{path}: camera {number} has the model {model}, not one of {known}; {fix}.")
 
 
 class _Cursor:
@@ -294,10 +292,8 @@ def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
         # Editors drop empty lines; the next image would then be taken for this one's 2D points.
         words = observed.split()
         if words and (len(words) % 3 or not words[-1].removeprefix("-").isdigit()):
-            raise InputError(
-                f"{path}, line {number}: not the 2D points of {name}; an image takes two lines, of which the "
-                "second may be empty: export the model again."
-            )
+            fix = "an image takes two lines, of which the second may be empty: export the model again"
+            raise InputError(f"{path}, line {number}: not the 2D points of {name}; {fix}.")
     return images
 
 

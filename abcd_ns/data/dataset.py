@@ -1,8 +1,4 @@
-"""nerfstudio's dataset over Photos, of what our own reader or another of nerfstudio's found.
-
-Others name files and cameras. Undistorting photos and putting them onto a background is done here as for our
-own reader: in memory, and checked beforehand.
-"""
+"""nerfstudio's dataset over Photos, of what our own reader or another of nerfstudio's found."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,7 +14,7 @@ from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
-from abcd_ns.data.picture_files import FileFinder, check_complete, check_two_files, read_size
+from abcd_ns.data.picture_files import FileFinder, check_two_files, read_size, read_whole
 from abcd_ns.data.scene import Lens, distorted_lens
 from abcd_ns.data.undistort import undistortion
 
@@ -78,20 +74,19 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
     alpha_color = None if outputs.alpha_color is None else tuple(map(float, outputs.alpha_color))
     sources, lenses, problems, finders = [], [], Problems(), {}
     for row, path in enumerate(outputs.image_filenames):
+        mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
         with problems.collect(name=str(path)):
             lens = _lens(outputs.cameras, row, str(path))
             stored = lens.size
             if needs_photos:
                 path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
-                if outputs.mask_filenames and path == outputs.mask_filenames[row].absolute():
+                if mask is not None and path == mask.absolute():
                     check_two_files(path, outputs.image_filenames[row].name, path.name)
-                stored = read_size(path)
-                check_complete(path)
+                stored = read_whole(path)
                 if not reduces_to(stored, lens.size):
                     shapes = f"is {stored[0]} x {stored[1]} but its camera is {lens.width} x {lens.height}"
                     raise InputError(f"{path} {shapes}; put the photos there that the model was made from.")
             flat = undistortion(lens) if lens.distorted else None
-            mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
             if mask is not None and needs_photos:
                 read_size(mask, "mask")
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
@@ -108,13 +103,12 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
 def pinhole_cameras(lenses: Sequence[Lens], poses: Float[Tensor, "n 3 4"]) -> Cameras:
     """nerfstudio's cameras [n], perspective, without distortion, float32."""
 
-    def column(name: str, dtype: torch.dtype) -> Tensor:
-        return torch.tensor([[getattr(lens, name)] for lens in lenses], dtype=dtype)
-
+    pinholes = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses], dtype=torch.float32)
+    sizes = torch.tensor([lens.size for lens in lenses], dtype=torch.int64)
     return Cameras(
-        camera_to_worlds=poses.float(),
-        **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
-        **{name: column(name, torch.int64) for name in ("width", "height")},
+        poses.float(),
+        *pinholes.reshape(-1, 4).split(1, dim=1),
+        *sizes.reshape(-1, 2).split(1, dim=1),
         camera_type=CameraType.PERSPECTIVE,
         metadata={},  # without any, `ns-export cameras` ends in an assertion
     )

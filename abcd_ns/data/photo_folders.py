@@ -8,14 +8,7 @@ from abcd_ns.data import DOWNSCALE, OPTION
 from abcd_ns.data.colmap_model import IMAGES
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.photos import PhotoSource
-from abcd_ns.data.picture_files import (
-    SUFFIXES,
-    FileFinder,
-    check_complete,
-    is_turned,
-    read_size,
-    visible_files,
-)
+from abcd_ns.data.picture_files import SUFFIXES, FileFinder, is_turned, read_size, read_whole, visible_files
 from abcd_ns.data.scene import Frame, Scene
 
 
@@ -82,19 +75,16 @@ def as_stored(scene: Scene) -> Scene:
         if any(abs(have * of_width - want * width) >= of_width for have, want in zip(*pair, strict=True)):
             return scene
     frames = [replace(f, lens=f.lens.resized(*size)) for f, size in zip(scene.frames, sizes, strict=True)]
-    scene.notes.append(
-        f"The photos in {scene.photo_folder} are {width / of_width:.3g} times as large as their cameras, as "
-        f"{width} x {height} px and {of_width} x {of_height}: cameras are scaled to them."
-    )
+    sizes = f"as {width} x {height} px and {of_width} x {of_height}: cameras are scaled to them"
+    larger = f"{width / of_width:.3g} times as large as their cameras"
+    scene.notes.append(f"The photos in {scene.photo_folder} are {larger}, {sizes}.")
     return replace(scene, frames=frames)
 
 
 def assume_photos(scene: Scene, factor: int) -> list[PhotoSource]:
     """The photos as the model describes them, without looking: for viewing and exporting."""
-    return [
-        PhotoSource(scene.photo_folder / f.name, f.lens.size, _reduce(f.name, f.lens.size, factor))
-        for f in scene.frames
-    ]
+    named = [(frame.name, frame.lens.size) for frame in scene.frames]
+    return [PhotoSource(scene.photo_folder / name, size, _reduce(name, size, factor)) for name, size in named]
 
 
 def _reduced_folders(scene: Scene) -> dict[int, Path]:
@@ -111,15 +101,12 @@ def _reduced_folders(scene: Scene) -> dict[int, Path]:
 
 def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> list[PhotoSource]:
     """The files of `frames` in a folder of photos reduced by `of`, to be reduced by `factor` in all."""
-    problems, finder = Problems(), FileFinder(folder, folder)
-    files: list[PhotoSource] = []
-    meant: dict[Path, str] = {}
+    problems, finder, files, meant = Problems(), FileFinder(folder, folder), [], {}
     for frame in frames:
         with problems.collect(name=frame.name):
             path = finder.find(frame.name)
-            size = read_size(path)
+            size = read_whole(path)
             _check_size(path, size, frame, of)
-            check_complete(path)
             files.append(PhotoSource(path, size, _reduce(str(path), size, factor // of)))
             if (other := meant.setdefault(path, frame.name)) != frame.name:
                 raise InputError(f"{path} is all there is of {other} and of {frame.name}; copy both there.")
@@ -141,14 +128,12 @@ def _check_size(path: Path, size: tuple[int, int], frame: Frame, of: int) -> Non
         return
     shape, wanted = f"{size[0]} x {size[1]}", f"{lens[0] / of:g} x {lens[1] / of:g}"
     if of == 1 and size == lens[::-1] and is_turned(path):
-        raise InputError(
-            f"{path} is stored as {shape} and turned by its EXIF orientation, but its camera is {wanted}; "
-            "save it turned and without EXIF, or make the model again."
-        )
-    raise InputError(
-        f"{path} is {shape} but its camera is {wanted}; use the photos that the model was made from "
-        f"(copies reduced N times go into a folder like images_N)."
-    )
+        shape = f"stored as {shape} and turned by its EXIF orientation,"
+        fix = "save it turned and without EXIF, or make the model again"
+    else:
+        copies = "copies reduced N times go into a folder like images_N"
+        fix = f"use the photos that the model was made from ({copies})"
+    raise InputError(f"{path} is {shape} but its camera is {wanted}; {fix}.")
 
 
 def _note_unposed(scene: Scene) -> None:

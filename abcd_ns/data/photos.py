@@ -48,7 +48,8 @@ class PhotoSource:
         return self.undistortion.pinhole.size if self.undistortion else self.reduced
 
 
-_Key = tuple[Callable[[PhotoSource], Tensor], int]  # what reads a photo or mask, and the source's index
+_Read = Callable[[PhotoSource], Tensor]  # of a photo or mask
+_Key = tuple[_Read, int]  # and the source's index
 
 
 def default_budget() -> int:
@@ -78,43 +79,41 @@ class Photos:
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
         """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it."""
-        return self._get((_read_photo, index))
+        return self._get(_read_photo, index)
 
     def expect(self, indices: Iterable[int]) -> None:
         """Begin to decode the first of these photos and their masks, if they are not kept, for the next
         requests: as many as take an eighth of the budget, and a few in any case."""
         for index in islice(indices, self._ahead):
-            self._expect((_read_photo, index))
+            self._expect(_read_photo, index)
             if self.sources[index].mask_path:
-                self._expect((_read_mask, index))
+                self._expect(_read_mask, index)
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
         """Which pixels count, or None where the photo has no mask. Do not write to it. A reduced or
         undistorted pixel counts only if all pixels that it is made of count."""
-        return self._get((_read_mask, index)) if self.sources[index].mask_path else None
+        return self._get(_read_mask, index) if self.sources[index].mask_path else None
 
-    def _read(self, key: _Key) -> Tensor:
-        read, index = key
-        return read(self.sources[index])
-
-    def _expect(self, key: _Key) -> None:
+    def _expect(self, read: _Read, index: int) -> None:
         """Read it on another thread, for the next `_get`."""
+        key = read, index
         with self._lock:
             if key in self._kept:
                 return
             if key not in self._expected:
-                self._expected[key] = self._readers.submit(self._read, key)
+                self._expected[key] = self._readers.submit(read, self.sources[index])
             self._expected.move_to_end(key)
             while len(self._expected) > 2 * self._ahead:  # with a mask each; else its visit is over
                 self._expected.popitem(last=False)[1].cancel()
 
-    def _get(self, key: _Key) -> Tensor:
+    def _get(self, read: _Read, index: int) -> Tensor:
+        key = read, index
         with self._lock:
             if key in self._kept:
                 return self._kept[key]
             expected = self._expected.pop(key, None)
         # Not under the lock, so that two threads may both read one.
-        value = self._read(key) if expected is None else expected.result()
+        value = read(self.sources[index]) if expected is None else expected.result()
         with self._lock:
             if value.nbytes <= self.budget_bytes:
                 self._kept[key] = value
@@ -123,7 +122,7 @@ class Photos:
 
 def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[np.ndarray, "y x c"]:
     """The mean of the area that each pixel covers; `size` is (width, height), at most the source's."""
-    if size == (image.shape[1], image.shape[0]):
+    if size == image.shape[1::-1]:
         return image
     reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return reduced.reshape(size[1], size[0], image.shape[2])
@@ -198,9 +197,8 @@ def _read_mask(source: PhotoSource) -> Tensor:
         shapes = f"{size[0]} x {size[1]} px, unlike its photo ({width} x {height})"
         raise InputError(f"{source.mask_path}: {shapes}; replace it.")
     used = area_reduce(mask * np.uint8(_MASK_USED), source.reduced)
-    used = np.where(used == _MASK_USED, used, 0)
     if source.undistortion:
-        used = source.undistortion.apply(used)
+        used = source.undistortion.apply(np.where(used == _MASK_USED, used, 0))
     if not (used == _MASK_USED).any():
         raise InputError(f"{source.mask_path} hides the whole photo; remove the frame or repair the mask.")
     return torch.from_numpy(used == _MASK_USED)

@@ -99,9 +99,8 @@ def by_loose_name(named: Iterable[tuple[str, T]]) -> dict[str, set[T]]:
     """What has a name, for `meant_by`; pictures by their names without the ending, too."""
     found: dict[str, set[T]] = {}
     for name, thing in named:
-        key = _loosely(name)
-        for each in {key, _without_ending(key)}:
-            found.setdefault(each, set()).add(thing)
+        for key in _loosely(name):
+            found.setdefault(key, set()).add(thing)
     return found
 
 
@@ -109,8 +108,8 @@ def meant_by(name: str, found: Mapping[str, set[T]], moved: bool = True) -> T | 
     """The only one whose name differs from `name` as `FileFinder.find` says; None if none or several do."""
     parts = [part for part in PureWindowsPath(name).parts if part != ".."]
     for start in range(len(parts) if moved else 1):
-        key = _loosely("/".join(parts[start:]))
-        meant = found.get(key) or found.get(_without_ending(key), ())
+        key, stem = _loosely("/".join(parts[start:]))
+        meant = found.get(key) or found.get(stem, ())
         if len(meant) == 1:
             return next(iter(meant))
     return None
@@ -129,13 +128,11 @@ def visible_files(folder: Path) -> Iterator[Path]:
         yield from (Path(at, name) for name in names if not name.startswith(_HIDDEN))
 
 
-def _loosely(path: str) -> str:
-    return unicodedata.normalize("NFC", path).casefold()
-
-
-def _without_ending(key: str) -> str:
+def _loosely(path: str) -> tuple[str, str]:
+    """What a path is compared by; and without the ending, if it is a picture's."""
+    key = unicodedata.normalize("NFC", path).casefold()
     stem, ending = os.path.splitext(key)
-    return stem if ending in SUFFIXES | UNREAD else key
+    return key, stem if ending in SUFFIXES | UNREAD else key
 
 
 def open_picture(path: Path) -> Image.Image:
@@ -199,8 +196,9 @@ def _check_kind(path: Path, picture: Image.Image) -> None:
         raise InputError(f"{path} is a {picture.mode} picture; convert it to RGB.")
 
 
-def check_complete(path: Path) -> None:
-    """Refuse a cut file, in one short read; only files with a doubtful end are decoded to make sure."""
+def read_whole(path: Path) -> tuple[int, int]:
+    """`read_size` of a photo. Refuses a cut file, too: where the end is doubtful, the photo is decoded."""
+    size = read_size(path)
     with path.open("rb") as file:
         file.seek(-min(64, path.stat().st_size), 2)
         tail = file.read()
@@ -211,3 +209,4 @@ def check_complete(path: Path) -> None:
                 picture.load()
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
+    return size

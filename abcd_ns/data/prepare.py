@@ -77,7 +77,6 @@ class Prepared:
     points: dict[str, Tensor]
     """points3D_xyz float32 [n, 3], world of training, and points3D_rgb uint8 [n, 3]; empty without any."""
     points_in_model: np.ndarray  # the same points, float64 [n, 3], in the scene's world
-    notes: tuple[str, ...]  # what the user should know but need not repair
     chosen: tuple[str, ...] = ()  # what was chosen where the user said nothing
 
 
@@ -122,14 +121,13 @@ def _advice(data: Path) -> str:
         return f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there"
     ends = {path.suffix.lower(): path for path in files}
     video, archive = (next((ends[e] for e in kind if e in ends), None) for kind in (_VIDEOS, _ARCHIVES))
-    if not SUFFIXES.isdisjoint(ends):  # photos, so that these are beside the point
-        video = archive = None
-    if video:
+    has_photos = not SUFFIXES.isdisjoint(ends)  # so that others are beside the point
+    if video and not has_photos:
         whole = data.with_suffix("") if data.is_file() else data
         at, film = shlex.quote(str(whole)), shlex.quote(str(video))
         frames = f"`mkdir -p {at}/images; ffmpeg -i {film} -r 2 {at}/images/%04d.jpg`"
         return f"make photos of the video with {frames}, then `abcd poses {at} --order video`"
-    if archive:
+    if archive and not has_photos:
         return f"unpack {archive} and give the folder that comes of it"
     if data.is_file():
         return "give the folder that holds the photos and a COLMAP model or a transforms.json"
@@ -172,27 +170,23 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
         notes.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
     chosen = wanted is None and not options.max_side and factor > 1
     reduced = (_reduction(scene, sources, factor),) if chosen and needs_photos else ()
-    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, tuple(notes), reduced)
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, reduced)
 
 
 def automatic_factor(scene: Scene, max_side: int = 0) -> int:
     """The smallest power of two that leaves no side longer than MAX_AUTO_SIDE, as nerfstudio's parsers have
     it, but by the largest photo. With `max_side` the smallest whole number that leaves none longer."""
-    longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
+    longest = max((max(frame.lens.size) for frame in scene.frames), default=1)
     if max_side:
-        return max(-(-longest // max_side), 1)
-    while longest / factor > MAX_AUTO_SIDE:
-        factor *= 2
-    return factor
+        return -(-longest // max_side)
+    return 2 ** max(math.ceil(math.log2(longest / MAX_AUTO_SIDE)), 0)
 
 
 def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
     full = max((frame.lens.size for frame in scene.frames), key=max)
     longest = max(max(source.reduced) for source in sources)
-    return (
-        f"Photos of up to {full[0]} x {full[1]} px are reduced {factor} times, to {longest} px at most, as "
-        f"splatfacto does; {DOWNSCALE} 1 keeps their size."
-    )
+    reduced = f"reduced {factor} times, to {longest} px at most, as splatfacto does"
+    return f"Photos of up to {full[0]} x {full[1]} px are {reduced}; {DOWNSCALE} 1 keeps their size."
 
 
 def check_masks(sources: list[PhotoSource]) -> None:
@@ -247,10 +241,8 @@ def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np
     if not good.all():
         notes.append(f"{model}: {(~good).sum()} points with NaN, infinity or absurd numbers are left out.")
     if not good.any():
-        notes.append(
-            f"{model} has no points: Gaussians start at random places, which costs quality; make some "
-            "with `point_triangulator` of the program colmap, or the whole model by `abcd poses`."
-        )
+        fix = "make some with `point_triangulator` of the program colmap, or the whole model by `abcd poses`"
+        notes.append(f"{model} has no points: Gaussians start at random places, which costs quality; {fix}.")
         return {}, np.empty((0, 3))
     rgb = scene.points_rgb
     if rgb is None:

@@ -53,9 +53,8 @@ class Lens:
     def resized(self, width: int, height: int) -> "Lens":
         """The same lens on a photo resampled to width x height; each axis has its own ratio."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
-        )
+        pinhole = self.fx * x, self.fy * y, self.cx * x, self.cy * y
+        return Lens(width, height, *pinhole, self.distortion, self.fisheye)
 
 
 @dataclass(frozen=True)
@@ -136,11 +135,11 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
         raise InputError(f"{label} holds NaN or infinity; remove the frame or repair its pose.")
     if (far := np.abs(matrix[:3, 3]).max()) > MAX_COORDINATE:
         raise InputError(f"{label} is {far:.1g} units from the origin; remove the frame or repair its pose.")
-    rotation = matrix[:3, :3].astype(np.float64)
-    u, stretch, vt = np.linalg.svd(rotation)
-    if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(rotation) < 0:
+    matrix = matrix.astype(np.float64)
+    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
+    if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(matrix[:3, :3]) < 0:
         raise InputError(f"{label} is no rotation (it scales or mirrors); repair its pose or remove it.")
-    return np.concatenate([u @ vt, matrix[:3, 3:].astype(np.float64)], axis=1)
+    return np.concatenate([u @ vt, matrix[:3, 3:]], axis=1)
 
 
 def check_layout(scene: Scene) -> None:
@@ -197,10 +196,10 @@ def split_lists(
 def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
     """The split of train_list.txt, val_list.txt and test_list.txt in `data`: a photo's name in each line.
     `known` is the name of each frame, by what the model calls it."""
-    paths, found = {split: data / f"{split}_list.txt" for split in SPLITS}, {}
-    for split, path in paths.items():
-        if path.is_file():
+    found = {}
+    for split in SPLITS:
+        if (path := data / f"{split}_list.txt").is_file():
             lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
             found[split] = [line.strip() for line in lines if line.strip()]
     known = {name: name for name in known.values()} | dict(known)
-    return split_lists(found, known, lambda split: str(paths[split]))
+    return split_lists(found, known, lambda split: f"{data / split}_list.txt")

@@ -46,10 +46,9 @@ def undistortion(lens: Lens) -> Undistortion:
     """
     K, coefficients = lens.matrix - _HALF_PIXEL, np.array(lens.distortion)
     if lens.fisheye:
-        new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-            K, coefficients, lens.size, np.eye(3), balance=0
-        )
-        x, y, width, height = 0, 0, lens.width, lens.height
+        estimate = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify
+        new = estimate(K, coefficients, lens.size, np.eye(3), balance=0)
+        x, y, width, height = 0, 0, *lens.size
     else:
         new, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(K, coefficients, lens.size, 0)
     zoom = np.array([new[0, 0] / lens.fx, new[1, 1] / lens.fy])
@@ -64,10 +63,9 @@ def undistortion(lens: Lens) -> Undistortion:
 
 def _unusable(lens: Lens) -> InputError:
     values = ", ".join(f"{value:g}" for value in lens.distortion)
-    return InputError(
-        f"a camera of {lens.width} x {lens.height} px has a distortion ({values}) that leaves no picture; "
-        "make the model again with a simpler camera model, or undistort it with `colmap image_undistorter`."
-    )
+    has = f"a camera of {lens.width} x {lens.height} px has a distortion ({values}) that leaves no picture"
+    fix = "make the model again with a simpler camera model, or undistort it with `colmap image_undistorter`"
+    return InputError(f"{has}; {fix}.")
 
 
 def _check_rays(lens: Lens, pinhole: Lens) -> None:

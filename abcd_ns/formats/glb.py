@@ -7,7 +7,6 @@ spherical harmonic. A viewer that does not know it shows points in their colours
 
 import json
 import struct
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from abcd_ns.engine.gaussians.similarity import quaternion
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
-from abcd_ns.formats.ply import GENERATOR
+from abcd_ns.formats.ply import GENERATOR, Content
 from abcd_ns.units import bytes_in_words
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -53,18 +52,11 @@ def values(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return arrays
 
 
-def write_glb(
-    path: Path,
-    count: int,
-    sh_degree: int,
-    up: Float[Tensor, "3 3"],
-    parts: Iterable[Gaussians],
-    antialiased: bool = False,
-) -> None:
+def write_glb(path: Path, up: Float[Tensor, "3 3"], content: Content) -> None:
     """As `write_scene`; UserError where one file cannot hold them. A node of the file has `up`, and values
     stay as they are. `antialiased` is noted in extras; the extension has no field for it."""
-    document = _document(count, sh_degree, up)
-    if antialiased:
+    count, document = content.count, _document(content.count, content.sh_degree, up)
+    if content.antialiased:
         document["meshes"][0]["primitives"][0]["extras"] = {"antialiased": True}
     words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
     head = 12 + 8 + words + 8
@@ -75,7 +67,7 @@ def write_glb(
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     with path.open("wb") as file:
         file.truncate(total)
-        for gaussians in parts:
+        for gaussians in content.parts:
             found = values(gaussians)
             for view, value in zip(document["bufferViews"], found.values(), strict=True):
                 file.seek(head + view["byteOffset"] + done * value.shape[1] * value.itemsize)

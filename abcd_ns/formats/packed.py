@@ -5,15 +5,14 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterable
+from dataclasses import replace
 
-import numpy as np
 import torch
 
 from abcd_ns.engine.gaussians.similarity import Similarity
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
-from abcd_ns.formats.ply import ANTIALIASED, columns, header, rows
+from abcd_ns.formats.ply import ANTIALIASED, Content, pieces
 
 OPENGL = Similarity(torch.diag(torch.tensor([1.0, -1, -1]).double()), torch.zeros(3).double(), 1.0)
 """To .spz's axes, right, up, back, from .ply's: right, down, front (nianticlabs/spz, README). Its readers
@@ -34,25 +33,20 @@ def check_installed() -> None:
         raise UserError(f"gaussforge is not there ({error}): pip install 'abcd-ns[export]'.") from None
 
 
-def packed(
-    count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians], antialiased: bool = False
-) -> bytes:
-    """A file of `count` Gaussians; `kind` is "spz", "sog" or "compressed.ply". Raises UserError."""
+def packed(kind: str, content: Content) -> bytes:
+    """A file; `kind` is "spz", "sog" or "compressed.ply". Raises UserError."""
     import gaussforge
 
-    table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0
-    for part in parts:
-        gaussians = OPENGL.gaussians(part) if kind == "spz" else part
-        table[done : done + len(gaussians)] = rows(gaussians)
-        done += len(gaussians)
-    if kind == "compressed.ply":
-        _transpose(table, sh_degree)
-    whole = header(count, sh_degree) + table.tobytes()
-    del table
-    found = gaussforge.GaussForge().convert(whole, "ply", kind)
+    parts = content.parts
+    if kind == "spz":
+        parts = map(OPENGL.gaussians, parts)
+    elif kind == "compressed.ply":
+        parts = map(_transposed, parts)
+    ply = b"".join(pieces(replace(content, parts=parts, antialiased=False)))
+    found = gaussforge.GaussForge().convert(ply, "ply", kind)
     if "error" in found:
         raise UserError(f".{kind} cannot be written: gaussforge says {found['error']}.")
-    return _marked(found["data"], kind) if antialiased else found["data"]
+    return _marked(found["data"], kind) if content.antialiased else found["data"]
 
 
 def _marked(data: bytes, kind: str) -> bytes:
@@ -72,9 +66,8 @@ def _marked(data: bytes, kind: str) -> bytes:
     return made.getvalue()
 
 
-def _transpose(table: np.ndarray, sh_degree: int) -> None:
+def _transposed(gaussians: Gaussians) -> Gaussians:
     """Undo in advance what gaussforge 0.6 does to a .compressed.ply: it writes red, green, blue of a harmonic
     together, where readers expect all of red, then of green and of blue, as in .ply."""
-    first, rest = columns(sh_degree).index("f_dc_2") + 1, 3 * ((sh_degree + 1) ** 2 - 1)
-    harmonics = table[:, first : first + rest]
-    harmonics[:] = harmonics.reshape(len(table), -1, 3).transpose(0, 2, 1).reshape(harmonics.shape)
+    rest = gaussians.features_rest
+    return replace(gaussians, features_rest=rest.transpose(1, 2).reshape(rest.shape))

@@ -1,7 +1,7 @@
 """The .ply file of 3D Gaussian Splatting, written part by part: no more than a part is ever in memory."""
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,6 +10,16 @@ from abcd_ns.engine.types import Gaussians
 
 GENERATOR = f"abcd_ns {__version__}"
 ANTIALIASED = "comment antialiased"  # opacities are to be compensated for the low-pass filter
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is written into a file."""
+
+    count: int  # Gaussians, in all
+    sh_degree: int
+    parts: Iterable[Gaussians]  # as they come
+    antialiased: bool = False  # see ANTIALIASED; files are marked so
 
 
 def columns(sh_degree: int) -> list[str]:
@@ -48,11 +58,8 @@ def header(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
-def write_ply(
-    path: Path, count: int, sh_degree: int, parts: Iterable[Gaussians], antialiased: bool = False
-) -> None:
-    """Write Gaussians as they come, `count` in all."""
-    with path.open("wb") as file:
-        file.write(header(count, sh_degree, antialiased))
-        for gaussians in parts:
-            file.write(rows(gaussians).tobytes())
+def pieces(content: Content) -> Iterator[bytes]:
+    """The file, part by part."""
+    yield header(content.count, content.sh_degree, content.antialiased)
+    for gaussians in content.parts:
+        yield rows(gaussians).tobytes()

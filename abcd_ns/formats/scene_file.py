@@ -1,6 +1,5 @@
 """The formats of an exported scene, chosen by the file's suffix, and how large its files would be."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -12,7 +11,7 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import write_glb
 from abcd_ns.formats.packed import BYTES_AT_ONCE, check_installed, packed
-from abcd_ns.formats.ply import columns, header, write_ply
+from abcd_ns.formats.ply import Content, columns, header, pieces
 
 PACKED = (".compressed.ply", ".spz", ".sog")
 SUFFIXES = (*PACKED, ".ply", ".glb")  # the longer of two that fit comes first
@@ -42,30 +41,20 @@ def rounding(suffix: str, largest: float) -> float:
     if suffix != ".spz":
         return largest * torch.finfo(torch.float32).eps
     if largest >= SPZ_REACH:
-        raise UserError(
-            f".spz reaches {SPZ_REACH:.0f} units from the origin, and the scene {largest:,.0f}; "
-            "use --frame nerfstudio, or another format."
-        )
+        reach = f"reaches {SPZ_REACH:.0f} units from the origin, and the scene {largest:,.0f}"
+        raise UserError(f".spz {reach}; use --frame nerfstudio, or another format.")
     return SPZ_STEP / 2
 
 
-def write_scene(
-    path: Path,
-    suffix: str,
-    count: int,
-    sh_degree: int,
-    up: Float[Tensor, "3 3"],
-    parts: Iterable[Gaussians],
-    antialiased: bool = False,
-) -> None:
-    """Write Gaussians as they come, `count` in all, in the format of a suffix. `up` turns their frame so that
-    y is up; `antialiased` marks the file: opacities are to be compensated for the low-pass filter."""
+def write_scene(path: Path, suffix: str, up: Float[Tensor, "3 3"], content: Content) -> None:
+    """Write Gaussians in the format of a suffix. `up` turns their frame so that y is up."""
     if suffix == ".ply":
-        write_ply(path, count, sh_degree, parts, antialiased)
+        with path.open("wb") as file:
+            file.writelines(pieces(content))
     elif suffix == ".glb":
-        write_glb(path, count, sh_degree, up, parts, antialiased)
+        write_glb(path, up, content)
     else:
-        path.write_bytes(packed(count, sh_degree, suffix[1:], parts, antialiased))
+        path.write_bytes(packed(suffix[1:], content))
 
 
 def ply_bytes(gaussians: Gaussians) -> int:
@@ -82,6 +71,6 @@ def spz_bytes(gaussians: Gaussians) -> int | None:
         return None
     try:
         check_installed()
-        return len(packed(len(kept), kept.sh_degree, "spz", [kept]))
+        return len(packed("spz", Content(len(kept), kept.sh_degree, [kept])))
     except UserError:
         return None

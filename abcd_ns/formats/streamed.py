@@ -21,7 +21,7 @@ from torch import Tensor
 
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.formats.packed import MOST_SOG, packed
-from abcd_ns.formats.ply import GENERATOR
+from abcd_ns.formats.ply import GENERATOR, Content
 
 LEVELS = 5  # each has half as many Gaussians as the one before
 NEIGHBOURS = 8  # with which a Gaussian may be merged
@@ -41,14 +41,11 @@ def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool =
     leaves, files, counts = [], [], [0] * LEVELS
     for gaussians in (leaf for part in parts for leaf in _leaves(part)):
         reach = gaussians.scales.exp().amax(dim=1, keepdim=True)
-        bound = {
-            "min": (gaussians.means - reach).amin(dim=0).tolist(),
-            "max": (gaussians.means + reach).amax(dim=0).tolist(),
-        }
-        lods = {}
+        low, high = (gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)
+        bound, lods = {"min": low.tolist(), "max": high.tolist()}, {}
         for level in range(LEVELS):
             name = f"{level}_{len(leaves)}"
-            sog = packed(len(gaussians), gaussians.sh_degree, "sog", [gaussians], antialiased)
+            sog = packed("sog", Content(len(gaussians), gaussians.sh_degree, [gaussians], antialiased))
             zipfile.ZipFile(io.BytesIO(sog)).extractall(folder / name)
             lods[str(level)] = {"file": len(files), "offset": 0, "count": len(gaussians)}
             files.append(f"{name}/meta.json")

@@ -81,7 +81,7 @@ class AbcdDataParser(DataParser):
             if options.as_stored and options.downscale_factor is None:
                 options = replace(options, downscale_factor=1)
             self._prepared = prepare(options, needs_photos=self.downscale_factor is None)
-            for note in (*self._prepared.chosen, *self._prepared.notes) if self.tells else ():
+            for note in (*self._prepared.chosen, *self._prepared.scene.notes) if self.tells else ():
                 say(one_line(note), "yellow")
         return self._prepared
 

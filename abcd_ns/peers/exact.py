@@ -1,7 +1,7 @@
 """Exact joint training over blocks, one block on the device at a time: the reference for gradients.
 
 NeRF-XL (Li et al., ECCV 2024) shows that volume rendering, and so its gradient, parts exactly over cells that
-tile space. In this engine's terms, for every step:
+tile space. In every step:
 
 1. every block's layer of the step's views is drawn, without gradients, and all are folded to the picture;
 2. the loss gives G = dL/dC, and every layer is drawn again, with gradients, between its own F and B:
@@ -90,8 +90,7 @@ class ExactTrainer(Trainer):
         rows, samples, first = tuple(sorted(views)), [], step * self.batch
         order = [endless_order(rows, first + k, self.config.seed) for k in range(self.batch + COMING)]
         self.announce(PhotosWanted(tuple(order)))
-        for place in range(self.batch):
-            view = views[order[place]]
+        for place, view in enumerate(views[row] for row in order[: self.batch]):
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels

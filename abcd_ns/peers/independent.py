@@ -2,18 +2,17 @@
 
 What published systems do that train large scenes by parts, in this engine's terms:
 
-- A block begins with the Gaussians of its cell enlarged by `overlap` (as in VastGaussian, Lin et al., CVPR
-  2024, and Mega-NeRF, Turki et al., CVPR 2022). It knows nothing of its neighbours' training.
+- A block begins with the Gaussians of its cell enlarged by `overlap`, as in VastGaussian (Lin et al., CVPR
+  2024) and Mega-NeRF (Turki et al., CVPR 2022). It knows nothing of its neighbours' training.
 - It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data. The
-  surface is that of the initial points; where there are none, the ray's far end stands for it. Each pixel is
-  thus some block's, and no block is asked for what it cannot explain.
-- Where the surface lies behind the cell, or the ray misses it, the block must stay clear: the target is the
-  background, another one in every step. Without that, blocks fill with floaters before others' surfaces;
-  VastGaussian's airspace-aware choice of cameras and BlockGaussian's auxiliary points are against the same.
+  surface is that of the initial points, or the ray's far end. So each pixel is some block's.
+- Where the surface lies behind the cell, or the ray misses it, the target is the background, another one in
+  every step. Without that, blocks fill with floaters before others' surfaces. VastGaussian's airspace-aware
+  choice of cameras and BlockGaussian's auxiliary points are against the same.
 - At the end it keeps the Gaussians whose means lie in its cell; all blocks together are the scene.
 
-A block has one visit, as long as its share of the budget by the views that say something about it, and every
-schedule runs over that visit. The store also holds each block as it began, under numbers of its own.
+A block has one visit, whose share of the budget is that of its views, and over which every schedule runs. The
+store also holds each block as it began, under numbers of its own.
 """
 
 import math

@@ -222,9 +222,8 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
             if found is None:
                 return None
             status, fields, content = found
-            policy = content_policy(headers["Host"])
-            extra = {"Content-Security-Policy": policy, "X-Content-Type-Options": "nosniff"}
-            return status, {**fields, **extra}, content
+            policy = {"Content-Security-Policy": content_policy(headers["Host"])}
+            return status, {**fields, **policy, "X-Content-Type-Options": "nosniff"}, content
 
         def read(connection: Any) -> Any:
             return handler(_Reader(connection, _rules=rules))
@@ -238,12 +237,8 @@ def read_message(frame: Any) -> Any:
     """A client's frame as viser's message; None if it is none."""
     from viser._messages import Message
 
-    if not isinstance(frame, bytes):
-        return None
-    try:
-        return Message.deserialize(frame)
-    except (*UNREADABLE, msgspec.MsgspecError):
-        return None
+    with suppress(*UNREADABLE, msgspec.MsgspecError):
+        return Message.deserialize(frame) if isinstance(frame, bytes) else None
 
 
 class _Overlay:

@@ -25,7 +25,7 @@ from abcd_ns.terminal import many
 from abcd_ns.viewer import texts
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
-from abcd_ns.viewer.pictures import Show
+from abcd_ns.viewer.pictures import Choice, Show
 from abcd_ns.viewer.scenery import Scenery, boxes_of, bulk, first_look, nearest_view, views_that_see
 
 AT_ONCE = (events.VisitBegan, events.VisitEnded, events.EpochEnded, events.PrunedAtEnd)
@@ -109,8 +109,6 @@ class AbcdPanel(ViewerControl):
         finally:
             lock.acquire()
 
-    # -- what is shown
-
     def _lay_out(self) -> None:
         """Make boxes and the list of blocks anew, as the tree is cut now."""
         tree, scene = self._model.tree, self._model.scene()
@@ -148,7 +146,7 @@ class AbcdPanel(ViewerControl):
             if not self._over:
                 self._over, self._controls.boxes.value = True, False  # they were about the training
         self._controls.write(headline=headline, epoch=epoch)
-        self._controls.progress(coordinator.progress)
+        self._controls.bar.value = round(100 * min(coordinator.progress, 1.0), 1)
         self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
         due = self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES
         if coordinator.finished or (due and self.viewer.viser_server.get_clients()):
@@ -205,11 +203,9 @@ class AbcdPanel(ViewerControl):
         client.camera.position, client.camera.look_at = self._first_look
         client.camera.on_update(lambda _: self._show_photo(client))
 
-    # -- what the user chooses
-
     def _choose(self) -> None:
         with self.viewer.train_lock or nullcontext():
-            self._model.choice.show, self._model.choice.block = self._controls.show, self._controls.block
+            self._model.choice = self._controls.choice
             self._cameras_of = self._photo_of = None
             self._update()
         for client in self.viewer.viser_server.get_clients().values():
@@ -230,7 +226,7 @@ class AbcdPanel(ViewerControl):
             self._controls.write(photo=f"{photo_image(self._photo(view.index).numpy(), name)}  \n{name}")
 
     def _show_cameras(self) -> None:
-        block = self._controls.block
+        block = self._model.choice.block
         if block is None and self._coordinator is not None:
             block = next(iter(self._active()), None)
         if not self._controls.cameras.value:
@@ -260,7 +256,7 @@ class Controls:
         with gui.add_folder("Blocks (ABCD)", order=order):
             if trains:
                 self._texts["headline"] = gui.add_markdown("Training has not begun.")
-                self._run = gui.add_progress_bar(0.0)
+                self.bar = gui.add_progress_bar(0.0)
                 self._texts["epoch"] = gui.add_markdown("")
             self._show = gui.add_dropdown("Show", options=tuple(show.value for show in Show))
             self._block = gui.add_dropdown("Block", options=(FOLLOW,) if trains else ("1",))
@@ -281,13 +277,9 @@ class Controls:
             handle.on_update(lambda _: changed())
 
     @property
-    def show(self) -> Show:
-        return Show(self._show.value)
-
-    @property
-    def block(self) -> int | None:
-        """The chosen block; None for the one in training."""
-        return None if self._block.value == FOLLOW else int(self._block.value) - 1
+    def choice(self) -> Choice:
+        block = None if self._block.value == FOLLOW else int(self._block.value) - 1
+        return Choice(Show(self._show.value), block)
 
     def set_blocks(self, count: int) -> None:
         names = tuple(str(block + 1) for block in range(count))
@@ -298,9 +290,3 @@ class Controls:
         for name, text in texts.items():
             if self._texts[name].content != text:
                 self._texts[name].content = text
-
-    def progress(self, share: float) -> None:
-        """Move the bar; 0..1."""
-        value = round(100 * min(share, 1.0), 1)
-        if self._run.value != value:
-            self._run.value = value

@@ -34,9 +34,9 @@ class Show(str, Enum):
     COMPOSITE = "composite: F, block, B"
 
 
-@dataclass
+@dataclass(frozen=True)
 class Choice:
-    """What the user chose to see. Written by the panel, read where pictures are drawn."""
+    """What the user chose to see."""
 
     show: Show = Show.EVERYTHING
     block: int | None = None  # None follows the block in training

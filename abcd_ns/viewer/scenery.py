@@ -69,8 +69,8 @@ class Scenery:
         """Show frusta of these cameras and no others."""
         for node in self._frusta:
             node.remove()
-        chosen = views[:: -(-len(views) // MOST_FRUSTA)] if views else []
-        self._frusta = [self._draw_frustum(view) for view in chosen]
+        step = max(-(-len(views) // MOST_FRUSTA), 1)
+        self._frusta = [self._draw_frustum(view) for view in views[::step]]
 
     def _draw_frustum(self, view: View) -> viser.SceneNodeHandle:
         turn = vtf.SO3.from_matrix(view.viewmat[:3, :3].T.double().cpu().numpy())

@@ -72,10 +72,8 @@ def reach(host: str) -> str | None:
     inside = any(mark.exists() for mark in CONTAINER_MARKS) or "KUBERNETES_SERVICE_HOST" in os.environ
     if not inside or host not in (THIS_MACHINE, "localhost"):
         return None
-    return (
-        f"The viewer listens on {host}, which from outside this container cannot be reached; "
-        "--viewer.websocket-host 0.0.0.0 and a published port let it be. It has no password."
-    )
+    fix = "--viewer.websocket-host 0.0.0.0 and a published port let it be. It has no password"
+    return f"The viewer listens on {host}, which from outside this container cannot be reached; {fix}."
 
 
 def clock(seconds: float | None) -> str:

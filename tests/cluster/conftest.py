@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from abcd_ns.cluster.assignment import Assignment, Finished, Member, Report, Workers
+from abcd_ns.cluster.assignment import Assignment, Member, Report, Workers
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -39,9 +39,9 @@ class InProcessWorkers(Workers):
             return []
         return [self._finish(min(busy, key=lambda member: member.assignment.number).put_down())]
 
-    def _finish(self, assignment: Assignment) -> Finished:
+    def _finish(self, assignment: Assignment) -> Report:
         outcome = self._worker.visit(assignment.task, assignment.state(), assignment.drawn)
-        return Finished(assignment.number, outcome)
+        return Report(assignment.number, outcome)
 
     def close(self) -> None: ...
 

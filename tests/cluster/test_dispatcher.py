@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 
-from abcd_ns.cluster.assignment import Finished, Lost, StepsSeen, WorkersError
+from abcd_ns.cluster.assignment import Report, WorkersError
 from abcd_ns.cluster.dispatcher import LOSSES
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import EpochEnded, VisitBegan, VisitEnded, WorkerLost
@@ -41,13 +41,13 @@ class Unreliable(InProcessWorkers):
         member, fate = self._fate(busy)
         assignment = member.put_down()
         if fate == "done":
-            return [*late, StepsSeen(assignment.number, 1, 20.0), self._finish(assignment)]
+            return [*late, Report(assignment.number, (1, 20.0)), self._finish(assignment)]
         self.lost += 1
         if fate == "late":  # and with another answer
             number, outcome = self._finish(assignment)
-            self._late = [Finished(number, replace(outcome, state=outcome.state.nobody))]
+            self._late = [Report(number, replace(outcome, state=outcome.state.nobody))]
             self.answered_late += 1
-        return [*late, Lost(assignment.number, fate)]
+        return [*late, Report(assignment.number, fate)]
 
 
 WARM_UP = {"density": STILL, "coarse_model": 40, "warmup": 0.3}
@@ -135,7 +135,7 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos):
         means = gaussians.means + 0.3 * torch.randn(gaussians.means.shape, generator=generator)
         return replace(outcome, state=replace(outcome.state, gaussians=replace(gaussians, means=means)))
 
-    run.workers.wait = lambda seconds: [Finished(n, elsewhere(outcome)) for n, outcome in wait(seconds)]
+    run.workers.wait = lambda seconds: [Report(n, elsewhere(outcome)) for n, outcome in wait(seconds)]
     moved, blocks = 0, set()
     while not run.finished:
         train_step(run, photos)

@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from abcd_ns.data.input_errors import SHOWN, InputError, Problems
-from abcd_ns.data.picture_files import check_complete, read_size
+from abcd_ns.data.picture_files import read_size, read_whole
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
@@ -220,7 +220,7 @@ def test_photos_that_pillow_takes_for_an_attack_are_read(tmp_path):
     text.add_itxt("XML:com.adobe.xmp", "x" * 2_000_000, zip=True)
     Image.new("RGB", SIZES[0]).save(long, pnginfo=text)
     assert read_size(long) == SIZES[0]
-    check_complete(long)
+    read_whole(long)
 
 
 def test_a_tile_of_a_photo_may_have_its_principal_point_in_the_corner(scene):

@@ -67,6 +67,7 @@ def test_photos_and_cameras_are_those_that_splatfacto_trains_on(tmp_path, kind, 
         for name in ("fx", "fy", "cx", "cy", "width", "height"):
             found = getattr(camera, name).item()
             assert found == pytest.approx(getattr(wanted, name).item(), abs=1e-3), name
+            assert getattr(camera, name).dtype == getattr(wanted, name).dtype, name
         difference = data["image"].int() - ours.get_data(row, "uint8")["image"].int()
         assert difference.abs().max() <= 1
     assert ours.cameras.distortion_params is None

@@ -162,7 +162,7 @@ def test_depths_and_normals_beside_a_split_are_no_photos_without_a_pose(tmp_path
     data = write_blender(tmp_path)
     for k in range(9):
         Image.new("RGB", (32, 24)).save(data / "test" / f"r_{k}_depth_0001.png")
-    assert "no pose" not in " ".join(parser(data).prepared().notes)
+    assert "no pose" not in " ".join(parser(data).prepared().scene.notes)
 
 
 def test_folders_that_are_links_are_searched_and_loops_end(scene):

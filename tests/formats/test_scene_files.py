@@ -22,6 +22,7 @@ from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import EXTENSION, Z_TO_Y, write_glb
+from abcd_ns.formats.ply import Content
 from abcd_ns.formats.scene_file import SUFFIXES, ply_bytes, spz_bytes, suffix_of, write_scene
 from abcd_ns.run.store import MadeFor
 from tests.cli.test_export import FRAME, run, scene, write_run  # noqa: F401
@@ -30,7 +31,7 @@ from tests.reference.scenes import random_gaussians
 
 def write(path, gaussians, suffix, parts=2, up=Z_TO_Y):
     pieces = (gaussians[rows] for rows in torch.arange(len(gaussians)).chunk(parts))
-    write_scene(path, suffix, len(gaussians), gaussians.sh_degree, up, pieces)
+    write_scene(path, suffix, up, Content(len(gaussians), gaussians.sh_degree, pieces))
     return path
 
 
@@ -112,7 +113,7 @@ def test_a_glb_stands_upright_in_either_frame(run, scene, tmp_path, frame):  # n
 
 def test_more_than_a_glb_can_hold_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"and a \.glb holds 4; use --by-block"):
-        write_glb(tmp_path / "large.glb", 20_000_000, 3, Z_TO_Y, [])
+        write_glb(tmp_path / "large.glb", Z_TO_Y, Content(20_000_000, 3, []))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ import torch
 from abcd_ns.cli.export import export
 from abcd_ns.data.ply import read_gaussians
 from abcd_ns.engine.types import PARAM_NAMES
-from abcd_ns.formats.ply import columns, write_ply
+from abcd_ns.formats.ply import Content, columns, pieces
 from tests.nerfstudio.crash_training import assert_same, gaussians
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.scenes import random_gaussians
@@ -22,6 +22,10 @@ def trained(data, tmp_path_factory) -> tuple[dict[str, torch.Tensor], Path]:
     found, file = run(configure(data, folder, steps=6)), folder / "scene.ply"
     export(found.base_dir, out=file)
     return sorted_rows(gaussians(found.base_dir)), file
+
+
+def write_ply(path: Path, *content, **options) -> None:
+    path.write_bytes(b"".join(pieces(Content(*content, **options))))
 
 
 def sorted_rows(scene: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

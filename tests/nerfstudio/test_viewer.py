@@ -18,7 +18,7 @@ from PIL import Image
 from abcd_ns.nerfstudio.trainer import on_this_machine
 from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.viewer.guard import rules_of
-from abcd_ns.viewer.pictures import Show
+from abcd_ns.viewer.pictures import Choice, Show
 from abcd_ns.viewer.scenery import COLORS
 from abcd_ns.viewer.texts import Status
 from tests.nerfstudio.test_training import configure, run
@@ -171,9 +171,9 @@ def test_what_the_viewer_shows_changes_no_evaluation(watched):
     model = watched.trainer.pipeline.model
     camera, _ = next(iter(watched.trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
     before = model.get_outputs_for_camera(camera)["rgb"]
-    model.choice.show, model.choice.block = Show.BLOCK, 0
+    model.choice = Choice(Show.BLOCK, 0)
     after = model.get_outputs_for_camera(camera)["rgb"]
-    model.choice.show, model.choice.block = Show.EVERYTHING, None
+    model.choice = Choice()
     assert bool((before == after).all())
 
 

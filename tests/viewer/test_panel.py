@@ -14,6 +14,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.viewer import panel as panel_module
 from abcd_ns.viewer.panel import AbcdPanel
+from abcd_ns.viewer.pictures import Choice
 
 
 def watched_panel(browsers: int = 1) -> AbcdPanel:
@@ -63,7 +64,8 @@ def test_a_browser_that_was_open_before_the_panel_is_shown_the_scene_too():
     viewer.viser_server.on_client_connect = lambda welcome: welcome(client)
     tree = build_kd(points, 2)
     scene = MemoryScene(tree, cloud_from_points(points, 255 * points, sh_degree=0).gaussians())
-    AbcdPanel(MagicMock(tree=tree, scene=lambda: scene), list, lambda _: None)._setup(viewer)
+    model = MagicMock(tree=tree, scene=lambda: scene, choice=Choice())
+    AbcdPanel(model, list, lambda _: None)._setup(viewer)
     assert isinstance(client.camera.look_at, np.ndarray)
 
 

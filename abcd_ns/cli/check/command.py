@@ -68,7 +68,7 @@ def examine(data: Path, downscale: int | None = None) -> tuple[Survey | None, li
         found = survey(data, downscale)
     except InputError as refused:
         return None, [error("input", line) for line in refused.lines]
-    own = [warning("input", said) for said in found.prepared.notes]
+    own = [warning("input", said) for said in found.prepared.scene.notes]
     own += [note("input", said) for said in found.prepared.chosen]
     return found, [*own, *doubts(found)]
 
