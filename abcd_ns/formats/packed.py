@@ -59,10 +59,11 @@ def _marked(data: bytes, kind: str) -> bytes:
         return gzip.compress(content, mtime=0)
     made = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w") as new:
-        files = {name: old.read(name) for name in old.namelist()}
-        files["meta.json"] = json.dumps({**json.loads(files["meta.json"]), "antialias": True})
-        for name, content in files.items():
-            new.writestr(name, content)
+        for file in old.infolist():  # with its time, so that the same scene is the same file
+            content = old.read(file)
+            if file.filename == "meta.json":
+                content = json.dumps({**json.loads(content), "antialias": True})
+            new.writestr(file, content)
     return made.getvalue()
 
 

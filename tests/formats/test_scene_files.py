@@ -233,6 +233,8 @@ def test_antialiased_runs_are_marked(run, scene, tmp_path, suffix, capsys):  # n
     export(write_run(tmp_path / "other", scene, **header), out=made)
     assert marked(made)
     assert "enable antialiasing in the viewer" in capsys.readouterr().out
+    if suffix == ".sog":  # no time of its own, by which the same scene would be two files
+        assert len({file.date_time for f in (plain, made) for file in zipfile.ZipFile(f).infolist()}) == 1
     if suffix in (".spz", ".sog", ".compressed.ply"):
         import gaussforge
 
