@@ -86,7 +86,9 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
                 if not reduces_to(stored, lens.size):
                     shapes = f"is {stored[0]} x {stored[1]} but its camera is {lens.width} x {lens.height}"
                     raise InputError(f"{path} {shapes}; put the photos there that the model was made from.")
-            flat = undistortion(lens) if lens.distorted else None
+            flat = None
+            with problems.collect(f"{path}: ", name=str(path)):  # which names no photo, as many may share it
+                flat = undistortion(lens) if lens.distorted else None
             if mask is not None and needs_photos:
                 read_size(mask, "mask")
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))

@@ -114,10 +114,14 @@ def test_a_larger_photo_is_reduced_to_its_camera(photo):
         ({"camera_type": CameraType.EQUIRECTANGULAR}, "is equirectangular"),
         ({"distortion_params": torch.tensor([[0.0, 0, 0, 0.1, 0, 0]])}, "has k4 = 0.1"),
         ({"fx": 1e9}, "has the focal length"),
+        (
+            {"distortion_params": torch.tensor([[-40.0, 0, 0, 0, 0, 0]])},
+            "a camera of 32 x 24 px has a distortion",
+        ),
     ],
 )
 def test_cameras_that_cannot_be_are_named(photo, camera, says):
-    with pytest.raises(InputError, match=f"{photo} {says}"):
+    with pytest.raises(InputError, match=f"{photo}:? {says}"):
         with_photos(outputs_of(photo, **camera))
 
 
