@@ -138,13 +138,18 @@ def _filled_within(
     reach, centers = widest_slant(views) * max(far for _, far in ends), centers_of(views)
     low, high = (end.cpu() for end in (means.amin(dim=0) - reach, means.amax(dim=0) + reach))
     within = ((low < centers) & (centers < high)).all(dim=1).tolist()
-    for view, (near, far) in compress(zip(views, ends, strict=True), within):
+
+    def between(view: View, near: float, far: float) -> Bool[Tensor, "n"]:
         matrix = view.viewmat.to(means)
         z = means @ matrix[2, :3] + matrix[2, 3]
-        (which,) = torch.where((z > near) & (z < far))
-        if len(which):  # nothing else is before them
-            shot = Shot(replace(view, near=near), view.full)
-            found[which] += weights(gaussians[which], rasterizer, [shot], antialiased=antialiased)[0]
+        return (z > near) & (z < far)
+
+    some = [(view, *end) for view, end in compress(zip(views, ends, strict=True), within)]
+    counts = torch.stack([between(*each).sum() for each in some]).tolist() if some else []  # one wait for all
+    for view, near, far in compress(some, counts):
+        (which,) = torch.where(between(view, near, far))
+        shot = Shot(replace(view, near=near), view.full)  # nothing else is before them
+        found[which] += weights(gaussians[which], rasterizer, [shot], antialiased=antialiased)[0]
     return found
 
 
