@@ -30,6 +30,7 @@ from abcd_ns.formats.packed import BYTES_AT_ONCE, MOST_SOG, WIDEST_SPZ
 from abcd_ns.formats.ply import Content
 from abcd_ns.formats.scene_file import PACKED, rounding, shows, suffix_of, write_scene
 from abcd_ns.formats.streamed import write_streamed
+from abcd_ns.machine import threads_wanted
 from abcd_ns.progress_bar import tracked
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.store import MADE_FOR
@@ -237,7 +238,8 @@ def _write_folder(scene: Shown, counts: dict[int, int], out: Path, suffix: str, 
     try:
         if lod:
             parts = (scene.gaussians(block) for block in tracked(counts, "writing"))
-            return write_streamed(out, parts, scene.antialiased)
+            processes = threads_wanted() if sum(counts.values()) > MOST_SOG else 1
+            return write_streamed(out, parts, scene.antialiased, processes)
         for block in tracked(counts, "writing"):
             _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
         return list(out.iterdir())

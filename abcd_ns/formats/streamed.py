@@ -5,12 +5,18 @@ the Gaussians, whose neighbours are merged by their moments.
 """
 
 import io
+import itertools
 import json
+import signal
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,8 +26,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
 from abcd_ns.formats.packed import MOST_SOG, packed
 from abcd_ns.formats.ply import GENERATOR, Content
+from abcd_ns.machine import end_with_parent
+
+Found = TypeVar("Found")
 
 LEVELS = 5  # each has half as many Gaussians as the one before
 NEIGHBOURS = 8  # with which a Gaussian may be merged
@@ -32,26 +42,20 @@ WIDER = 0.25
 as it was, but blurs captures."""
 
 
-def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool = False) -> list[Path]:
+def write_streamed(
+    folder: Path, parts: Iterable[Gaussians], antialiased: bool = False, processes: int = 1
+) -> list[Path]:
     """Write `parts`, one after the other, into a folder; returns its files: lod-meta.json, and by leaf and
     level an unpacked .sog.
 
-    RAM holds one part. Parts that follow each other should be near each other: the tree joins them in order.
+    RAM holds one part, and a leaf for each of the `processes` that pack. Parts that follow each other should
+    be near each other: the tree joins them in order. Raises UserError.
     """
-    leaves, files, counts = [], [], [0] * LEVELS
-    for gaussians in (leaf for part in parts for leaf in _leaves(part)):
-        reach = gaussians.scales.exp().amax(dim=1, keepdim=True)
-        low, high = (gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)
-        bound, lods = {"min": low.tolist(), "max": high.tolist()}, {}
-        for level in range(LEVELS):
-            name = f"{level}_{len(leaves)}"
-            sog = packed("sog", Content(len(gaussians), gaussians.sh_degree, [gaussians], antialiased))
-            zipfile.ZipFile(io.BytesIO(sog)).extractall(folder / name)
-            lods[str(level)] = {"file": len(files), "offset": 0, "count": len(gaussians)}
-            files.append(f"{name}/meta.json")
-            counts[level] += len(gaussians)
-            gaussians = merged_in_pairs(gaussians)
-        leaves.append({"bound": bound, "lods": lods})
+    leaves = (leaf for part in parts for leaf in _leaves(part))
+    calls = ((folder, number, leaf, antialiased) for number, leaf in enumerate(leaves))
+    nodes = list(_done(_write_leaf, calls, processes))
+    counts = [sum(node["lods"][str(level)]["count"] for node in nodes) for level in range(LEVELS)]
+    files = [f"{level}_{number}/meta.json" for number in range(len(nodes)) for level in range(LEVELS)]
     meta = {
         "version": 1,
         "asset": {"generator": GENERATOR},
@@ -59,11 +63,49 @@ def write_streamed(folder: Path, parts: Iterable[Gaussians], antialiased: bool =
         "counts": counts,
         "lodLevels": LEVELS,
         "filenames": files,
-        "tree": _tree(leaves),
+        "tree": _tree(nodes),
     }
     index = folder / "lod-meta.json"
     index.write_text(json.dumps(meta))
     return [index, *(path for name in files for path in (folder / name).parent.iterdir())]
+
+
+def _done(function: Callable[..., Found], calls: Iterable[tuple], processes: int) -> Iterator[Found]:
+    """What a function returns for each tuple of arguments, in their order. Few calls wait at a time."""
+    if processes == 1:
+        yield from itertools.starmap(function, calls)
+        return
+    waiting: deque[Future[Found]] = deque()
+    try:
+        # Processes, as gaussforge holds Python's lock.
+        with ProcessPoolExecutor(processes, get_context("spawn"), _begin_process) as pool:
+            for call in calls:
+                waiting.append(pool.submit(function, *call))
+                if len(waiting) > processes:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+    except BrokenProcessPool:
+        raise UserError("A process that packs was killed: free memory, and export again.") from None
+
+
+def _begin_process() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits
+    end_with_parent()
+    torch.set_num_threads(1)
+
+
+def _write_leaf(folder: Path, number: int, gaussians: Gaussians, antialiased: bool) -> dict[str, Any]:
+    """Write the levels of a leaf, coarser and coarser; returns its node of the tree."""
+    reach = gaussians.scales.exp().amax(dim=1, keepdim=True)
+    low, high = (gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)
+    lods = {}
+    for level in range(LEVELS):
+        sog = packed("sog", Content(len(gaussians), gaussians.sh_degree, [gaussians], antialiased))
+        zipfile.ZipFile(io.BytesIO(sog)).extractall(folder / f"{level}_{number}")
+        lods[str(level)] = {"file": LEVELS * number + level, "offset": 0, "count": len(gaussians)}
+        gaussians = merged_in_pairs(gaussians)
+    return {"bound": {"min": low.tolist(), "max": high.tolist()}, "lods": lods}
 
 
 def _leaves(gaussians: Gaussians) -> Iterator[Gaussians]:

@@ -1,6 +1,8 @@
 """Levels of detail, and the folder of streamed SOG that holds them."""
 
 import json
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,7 @@ import abcd_ns
 from abcd_ns.cli import export as export_module
 from abcd_ns.errors import UserError
 from abcd_ns.formats import streamed
-from abcd_ns.formats.streamed import MOST_OPAQUE, merged, merged_in_pairs, pairs
+from abcd_ns.formats.streamed import MOST_OPAQUE, merged, merged_in_pairs, pairs, write_streamed
 from tests.cli.test_export import export, run, scene  # noqa: F401
 from tests.reference.scenes import random_gaussians
 
@@ -133,6 +135,24 @@ def test_a_folder_is_what_the_format_describes(run, scene, tmp_path, monkeypatch
             totals[int(level)] += part["count"]
     assert totals == meta["counts"]
     assert len(meta["filenames"]) == len(leaves) * meta["lodLevels"]
+
+
+def killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_processes_write_the_same_and_one_that_is_killed_ends_it_in_a_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(streamed, "MOST_SOG", 100)
+    written = []
+    for processes in (1, 2):
+        (folder := tmp_path / str(processes)).mkdir()
+        write_streamed(folder, [random_gaussians(300, sh_degree=1)], processes=processes)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        written.append({path.relative_to(folder): path.read_bytes() for path in files})
+    assert written[0] == written[1]
+    monkeypatch.setattr(streamed, "_write_leaf", killed)
+    with pytest.raises(UserError, match="A process that packs was killed: free memory"):
+        write_streamed(tmp_path, [random_gaussians(300)], processes=2)
 
 
 def test_it_takes_a_new_folder_and_leaves_none_behind(run, tmp_path, monkeypatch):  # noqa: F811
