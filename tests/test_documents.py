@@ -155,7 +155,7 @@ def memory_table() -> str:
         "| --- |" + " ---: |" * len(BUDGETS),
     ]
     for megapixels in PHOTOS:
-        needs = DeviceNeeds(megapixels * 10**6, batch=1, waiting=3)
+        needs = DeviceNeeds(megapixels * 10**6, batch=1, in_parts=True)
         limits = [needs.block_limit(budget << 30) / 1e6 for budget in BUDGETS]
         cells = [f"{limit:.1f} million" if limit > 0 else "-" for limit in limits]
         lines.append(f"| {megapixels} megapixels | " + " | ".join(cells) + " |")
@@ -163,7 +163,7 @@ def memory_table() -> str:
 
 
 def test_what_a_gaussian_takes_is_what_the_reference_says():
-    takes = [DeviceNeeds(1, batch=1, waiting=3, active_degree=degree).gaussian_bytes for degree in (0, 3)]
+    takes = [DeviceNeeds(1, batch=1, active_degree=degree, in_parts=True).gaussian_bytes for degree in (0, 3)]
     assert "takes {:,} bytes instead of {:,}".format(*takes) in REFERENCE.replace("\n", " ")
     assert f"up to {takes[1] / takes[0]:.1f} times as many" in TUTORIAL.replace("\n", " ")
 

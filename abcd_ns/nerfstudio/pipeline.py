@@ -128,6 +128,8 @@ class AbcdPipeline(VanillaPipeline):
         Keeps what the coordinator needs after the step."""
         self._errors, earlier = [], 0.0
         while True:
+            if self._drawn:
+                self._drawn[-1] = self.coordinator.gathered(self._drawn[-1])
             outputs, losses, metrics = super().get_train_loss_dict(step)
             self._drawn.append(outputs.pop("rendered").kept)
             self._errors += outputs.pop("errors")

@@ -230,7 +230,8 @@ class ExactTrainer(Trainer):
         )
         growth = {name: value.to(self.device) for name, value in state.growth.items()}
         judged = self._judged(gradients.sums[:, rows])
-        growth, refined = self.run.density.after_step(self.params, self.optimizers, growth, (), judged, clock)
+        growth = self.run.density.gather(self.params, growth, (), judged, clock.views)
+        growth, refined = self.run.density.after_step(self.params, self.optimizers, growth, clock)
         if refined:
             clocks = replace(clocks, refined=clock.steps)
         stepped = detach(self.params, self.optimizers, growth, clocks)

@@ -49,6 +49,7 @@ def train_plain(
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, refined=refined)
         judged = Judged(view, raster.info["sums"].values[0], error)
         judged = [judged] if density.asks(taken / steps, first=False) else []
-        growth, refines = density.after_step(params, adam, growth, (raster.info,), judged, clock)
+        growth = density.gather(params, growth, (raster.info,), judged, clock.views)
+        growth, refines = density.after_step(params, adam, growth, clock)
         refined = clock.steps if refines else refined
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})

@@ -34,9 +34,8 @@ def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = Non
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
-    waiting, degree = 0 if blocks == 1 else 3, 3 - fit.limits.late_harmonics
-    options = {"crop_pixels": fit.limits.crop_pixels, "levels": levels_of(blocks), "waiting": waiting}
-    return DeviceNeeds(pixels, 1, **options, active_degree=degree)
+    options = {"crop_pixels": fit.limits.crop_pixels, "levels": levels_of(blocks), "in_parts": blocks > 1}
+    return DeviceNeeds(pixels, 1, **options, active_degree=3 - fit.limits.late_harmonics)
 
 
 def peak_of(needs: DeviceNeeds, gaussians: int) -> int:
@@ -171,7 +170,7 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
 def test_what_a_scene_may_become_is_no_reason_to_cut_it_now():
     grows = fit_for(24, PIXELS, 2_000_000, most=120_000_000)
     assert (grows.blocks, grows.blocks_at_the_end > 10) == (1, True)
-    assert fit_for(24, PIXELS, 200_000_000).blocks >= 10
+    assert fit_for(24, PIXELS, 200_000_000).blocks >= 9
     assert fit_for(24, PIXELS, 200_000_000, most=2_000_000).blocks == 1
 
 

@@ -65,7 +65,8 @@ def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, given):
 
 
 @pytest.mark.parametrize(
-    ("batch", "given"), [(4, {}), (1, {"primitive": "2dgs"}), (1, {"late_harmonics": 3})]
+    ("batch", "given"),
+    [(4, {}), (4, {"batch_limit": 1}), (1, {"primitive": "2dgs"}), (1, {"late_harmonics": 3})],
 )
 def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, batch, given):
     options = {"width": 32, "batch": batch, "density": GROWING, **given}
@@ -74,7 +75,9 @@ def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, batch, given):
     )
     primitive = given.get("primitive", "3dgs")
     degree = 3 - given.get("late_harmonics", 0)
-    needs = DeviceNeeds(32**2, batch, levels=0, primitive=primitive, active_degree=degree)
+    at_once = given.get("batch_limit", batch)
+    options = {"primitive": primitive, "active_degree": degree, "in_parts": at_once < batch}
+    needs = DeviceNeeds(32**2, at_once, levels=0, **options)
     model = needs.gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH_GAUSSIAN * (large - small)
 

@@ -75,6 +75,9 @@ class Coordinator(Trainer):
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         return self.visit.loss(batch, pictures, photos)
 
+    def gathered(self, rendered: Rendered) -> Rendered:
+        return self.visit.gathered(rendered)
+
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Grow and prune, and end the visit when its steps are done."""
         if self.poses is not None:

@@ -24,8 +24,6 @@ FLOAT = 4
 """Bytes."""
 PROJECTED_FLOATS = 8.2
 """Of each row of a Gaussian in a view: itself, copies sorted by tile, their gradients, sums of residuals."""
-KEPT_FLOATS = 12
-"""Of a Gaussian in a view that its step drew before the last: a weight, its gradient, sums of residuals."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
@@ -45,7 +43,7 @@ class DeviceNeeds:
     Args:
         pixels: of the largest image.
         batch: views that are drawn at once.
-        waiting: other views of a step, at most.
+        in_parts: whether a step draws others after them, whose gradients are added to theirs.
         crop_pixels: of a view that a step trains on at most; 0 is no limit.
         levels: layers of one view that are held, at most, while blocks are folded, see `levels_of`.
         keeps: whether layers and photos are kept there, too. Not on the CPU, whose RAM has a budget for them.
@@ -60,8 +58,8 @@ class DeviceNeeds:
     levels: int = 2
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
-    waiting: int = 0
     active_degree: int | None = None
+    in_parts: bool = False
 
     @property
     def parameter_bytes(self) -> int:
@@ -70,9 +68,8 @@ class DeviceNeeds:
 
     @property
     def gaussian_bytes(self) -> int:
-        """Of one Gaussian in training: parameters, gradient, two moments, and what drawings hold of it."""
-        drawn = self.batch * projected_bytes(self.primitive) + self.waiting * KEPT_FLOATS * FLOAT
-        return 4 * self.parameter_bytes + drawn
+        """Of one Gaussian in training: parameters, gradients, two moments, and what drawings hold of it."""
+        return (4 + self.in_parts) * self.parameter_bytes + self.batch * projected_bytes(self.primitive)
 
     @property
     def step_bytes(self) -> int:
@@ -146,7 +143,7 @@ def needs_of_step(
     limits = config.limits
     at_once, crop = min(views, limits.batch_limit or views), limits.crop_pixels
     sh_degree = config.growing_degree if sh_degree is None else sh_degree
-    options = {"primitive": config.primitive, "waiting": views - at_once, "active_degree": sh_degree}
+    options = {"primitive": config.primitive, "active_degree": sh_degree, "in_parts": views > at_once}
     return DeviceNeeds(pixels, at_once, config.sh_degree, crop, **options)
 
 

@@ -49,10 +49,15 @@ class Trainer(ABC):
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """What a batch adds to the loss of a step."""
 
+    def gathered(self, rendered: Rendered) -> Rendered:
+        """Call with what a part drew, after its backward, before the next is drawn. What its Gaussians were
+        found to do is added up; gives what `after_step` still wants."""
+        return rendered
+
     @abstractmethod
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
-        """Call after the optimizers stepped, with what all parts of the step drew (`Rendered.kept` suffices)
-        and each picture's mean squared error."""
+        """Call after the optimizers stepped, with what all parts of the step drew (`Rendered.kept` suffices,
+        `gathered` of all but the last) and each picture's mean squared error."""
 
     def complete(self) -> None:  # noqa: B027 - most have nothing left to do
         """Call when the run is finished: does what comes after the last step, if it was not done."""

@@ -51,6 +51,8 @@ def take_step(
     for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     for part in batch.parts():
+        if drawn:
+            drawn[-1] = training.gathered(drawn[-1])
         rendered = training.render(part)
         loss, found = assess(part, rendered)
         drawn.append(rendered.kept)

@@ -1,6 +1,7 @@
 """The training of one visit's block, in whichever process has the block."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -112,6 +113,11 @@ class VisitTraining:
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         self._rendered = None
         return batch.loss(pictures, photos, self.run.config)
+
+    def gathered(self, rendered: Rendered) -> Rendered:
+        """As Trainer.gathered."""
+        self.block.gather(rendered.infos, self._residuals.found())
+        return replace(rendered, infos=())
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """As Trainer.after_step: grows and prunes."""

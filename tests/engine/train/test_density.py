@@ -46,7 +46,7 @@ def test_the_default_strategy_splits_what_is_worth_it(monkeypatch):
     params, optimizers = activated(gaussians)
     control = DensityControl(DensityConfig(split_pixels=6.0, cull_alpha_thresh=0.0))
     growth = statistics(*[7.0] * 5, *[5.0] * 3)
-    growth, refined = control.after_step(params, optimizers, growth, (), (), clock())
+    growth, refined = control.after_step(params, optimizers, growth, clock())
     assert refined
     assert len(params["means"]) == 13
     assert not bool(growth[WORTH].any())
@@ -61,7 +61,7 @@ def test_a_refinement_adds_at_most_a_tenth_best_first(room, added):
     params, optimizers = activated(random_gaussians(300, size=0.001))
     control = DensityControl(DensityConfig(cull_alpha_thresh=0.0))
     before = params["means"].detach().clone()
-    given = statistics(*range(100, 400)), (), (), clock(room=room)
+    given = statistics(*range(100, 400)), clock(room=room)
     control.after_step(params, optimizers, *given)
     assert len(params["means"]) == 300 + added
     assert torch.equal(params["means"][: 300 - added], before[: 300 - added])  # the best are the last
@@ -88,7 +88,7 @@ def test_without_room_nothing_is_added_but_the_transparent_go_and_the_large_stay
     gaussians.scales[5] = math.log(5.0)
     params, optimizers = activated(gaussians)
     control = DensityControl(DensityConfig())
-    control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock(room=0))
+    control.after_step(params, optimizers, statistics(*[99.0] * 8), clock(room=0))
     assert torch.equal(params["means"], gaussians.means[3:])
 
 

@@ -160,30 +160,35 @@ class DensityControl:
         begins, ends = self.config.refine_start, self.config.refine_stop
         return max(ends, pruning.LAST) if first and begins < ends else ends
 
-    def after_step(
+    def gather(
         self,
         params: Params,
-        optimizers: Optimizers,
         growth: dict[str, Tensor],
         infos: Infos,
         judged: Sequence[Judged],
-        clock: DensityClock,
-    ) -> tuple[dict[str, Tensor], bool]:
-        """Gather statistics and, when it is time, refine. Call after Adam's step.
+        views: int,
+    ) -> dict[str, Tensor]:
+        """The block's statistics with what drawings of some of its views add.
 
         Args:
-            growth: the block's statistics so far, each [n, ...]; WORTH is changed in place.
-            infos, judged: of the step's drawings, after backward; pictures whose residuals were summed.
-
-        Returns:
-            The block's statistics from now on, and whether it was refined.
+            growth: the statistics so far, each [n, ...]; WORTH is changed in place.
+            infos, judged: of drawings, after backward; pictures whose residuals were summed.
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
-            return growth, False
-        sums = pruning.blend_sums(infos, clock.views)
+            return growth
+        sums = pruning.blend_sums(infos, views)
         growth = {**growth, **{name: growth.get(name, 0.0) + value for name, value in sums.items()}}
         for picture in judged:
             growing.add_picture(growth, active_gaussians(params).detach(), self._axes, picture)
+        return growth
+
+    def after_step(
+        self, params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clock: DensityClock
+    ) -> tuple[dict[str, Tensor], bool]:
+        """Refine when it is time, by what was gathered. Call after Adam's step; gives the block's statistics
+        from now on, and whether it was refined."""
+        if self.config.strategy == "off" or len(params["means"]) == 0:
+            return growth, False
         if not self.asks(clock.progress, clock.first):
             growth.pop(WORTH, None)
         # What a picture shows is asked for last: an accelerator is waited for.

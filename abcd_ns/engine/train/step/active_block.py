@@ -97,6 +97,11 @@ class ActiveBlock:
         self.growth.pop(LARGEST, None)
         self.clocks = replace(self.clocks, visits=self.clocks.visits + counts)
 
+    def gather(self, infos: Infos, judged: Sequence[Judged]) -> None:
+        """Add to the statistics what a part of a step drew, see DensityControl.gather."""
+        run = self._run
+        self.growth = run.density.gather(run.params, self.growth, infos, judged, len(run.active.trained_on))
+
     def after_step(
         self, taken: int, batch: int, room: int | None, infos: Infos, judged: Sequence[Judged]
     ) -> DensityClock:
@@ -105,16 +110,15 @@ class ActiveBlock:
         Args:
             taken: views that the step drew, of the `batch` that it was made for.
             room: Gaussians that may be added.
-            infos, judged: see DensityControl.after_step; none where gradients were no numbers.
+            infos, judged: of what was not gathered yet; none where gradients were no numbers.
         """
         run, clocks = self._run, self.clocks
         self.clocks = replace(clocks, adam_views=clocks.adam_views + batch, steps=clocks.steps + taken)
         clock = self.density_clock(taken, batch, room)
         for parameter in run.params.values():  # their memory is for what growth takes
             parameter.grad = None
-        self.growth, refined = run.density.after_step(
-            run.params, run.optimizers, self.growth, infos, judged, clock
-        )
+        self.gather(infos, judged)
+        self.growth, refined = run.density.after_step(run.params, run.optimizers, self.growth, clock)
         if refined:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.growth.pop(LARGEST, None)

@@ -154,7 +154,7 @@ class Rendered:
 
     @property
     def kept(self) -> "Rendered":
-        """What `Trainer.after_step` reads of it: neither pictures nor what backward goes through."""
+        """What `Trainer` reads of it after backward: neither pictures nor what backward goes through."""
         kept = "weights", "sums"
         infos = tuple({name: info[name] for name in kept if name in info} for info in self.infos)
         return replace(self, pictures=(), rasters=(), infos=infos)
