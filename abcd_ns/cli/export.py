@@ -90,9 +90,9 @@ def export(
         counts = {block: n for block in tracked(scene.blocks, "counting") if (n := scene.count(block))}
         if not counts:
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
-        if suffix in PACKED:
-            most = (max if by_block or lod else sum)(counts.values())
-            if suffix == ".sog" and not lod and most > MOST_SOG and scene.sh_degree:
+        if suffix in PACKED and not lod:
+            most = (max if by_block else sum)(counts.values())
+            if suffix == ".sog" and most > MOST_SOG and scene.sh_degree:
                 why = f"A .sog of {most:,} Gaussians with harmonics takes too long; {MOST_SOG:,} are quick"
                 raise UserError(f"{why}. To pack more, use --lod, or .compressed.ply.")
             ram = bytes_in_words(most * BYTES_AT_ONCE)
