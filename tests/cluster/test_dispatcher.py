@@ -149,6 +149,13 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos):
         assert bool((run.scene.tree.assign(means) == block).all())
 
 
+def test_a_scene_that_is_cut_anew_keeps_two_blocks_for_each_visit_at_once(make, photos):
+    run = make(workers=2, lag=2, density=STILL, steps=90, block_limit=90)
+    assert run.scene.tree.num_blocks > 4
+    train(run, photos)
+    assert run.scene.tree.num_blocks == 4
+
+
 @pytest.mark.parametrize("goes_on_with", [None, 3])
 def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_on_with):
     """Also alone: what was out is planned again."""

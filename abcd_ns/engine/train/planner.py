@@ -200,14 +200,14 @@ class Planner(Visits):
             shares.append(left / sum(map(_views_of, state.queue)))
         return min(shares)
 
-    def _cut_anew(self) -> None:
+    def _cut_anew(self, at_once: int) -> None:
         """Once growth has ended, cut the scene into fewer blocks where pruning has left room, if RAM holds
-        it. A BlocksBusyError while a block is in flight."""
+        it; two at least for each visit `at_once`. A BlocksBusyError while a block is in flight."""
         run, config = self._run, self._config
         limit, count = limits_at(config, config.sh_degree).block_limit, run.count()
         if run.share < config.density.refine_stop or not config.recipe.migrate or not limit:
             return
-        blocks = max(math.ceil(count / max(REFILLED * limit, 1.0)), 2)
+        blocks = max(math.ceil(count / max(REFILLED * limit, 1.0)), 2 * at_once)
         of_each = 3 * parameter_bytes(config.sh_degree)  # with moments
         if blocks >= run.blocks or 2 * of_each * count > self._scene.ram_bytes:
             return
@@ -222,7 +222,7 @@ class Planner(Visits):
     def _plan_epoch(self, at_once: int) -> None:
         """Queue the visits of the next epoch; none where all that are seen are hidden behind others."""
         if self._run.state.views:
-            self._cut_anew()
+            self._cut_anew(at_once)
         recipe, state, blocks = self._config.recipe, self._run.state, self._scene.tree.num_blocks
         if not state.views:
             views = {}
