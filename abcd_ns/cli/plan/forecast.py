@@ -40,7 +40,7 @@ PLACES = {
 }
 """Where memory is needed, and the words for a lack of it, with the fix."""
 DAY = 24  # hours from which on a forecast names ways to take less
-LOST = {1 / 4: 0.8, 1 / 8: 1.7, 1 / 16: 2.8}
+LOST = {1 / 4: 0.8, 1 / 8: 0.9, 1 / 16: 2.8}
 """dB below one block, by the share of its memory for Gaussians that a block has. The most of four scenes, 160
 px wide (docs/results/README.md)."""
 LAYERS_BY_STEPS = 0.15
