@@ -48,8 +48,8 @@ def write_streamed(
     """Write `parts`, one after the other, into a folder; returns its files: lod-meta.json, and by leaf and
     level an unpacked .sog.
 
-    RAM holds one part, and a leaf for each of the `processes` that pack. Parts that follow each other should
-    be near each other: the tree joins them in order. Raises UserError.
+    RAM holds one part, and some 330 MiB for each of several `processes`, which pack leaves. Parts that
+    follow each other should be near each other: the tree joins them in order. Raises UserError.
     """
     leaves = (leaf for part in parts for leaf in _leaves(part))
     calls = ((folder, number, leaf, antialiased) for number, leaf in enumerate(leaves))

@@ -152,7 +152,7 @@ def test_processes_write_the_same_and_one_that_is_killed_ends_it_in_a_line(tmp_p
     assert written[0] == written[1]
     monkeypatch.setattr(streamed, "_write_leaf", killed)
     with pytest.raises(UserError, match="A process that packs was killed: free memory"):
-        write_streamed(tmp_path, [random_gaussians(300)], processes=2)
+        write_streamed(tmp_path, [random_gaussians(50)], processes=2)
 
 
 def test_it_takes_a_new_folder_and_leaves_none_behind(run, tmp_path, monkeypatch):  # noqa: F811
