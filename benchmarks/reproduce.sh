@@ -23,7 +23,7 @@ rows() { # by the name, minutes, then `abcd`'s command, with the scene's name fo
     for scene in $small; do
         trained budgets/$scene 25 $scene 4 --steps 4000 --budgets 1/4 1/8 1/16 --methods abcd $two_seeds
     done
-    trained budgets/castle-P30-640 50 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd
+    trained budgets/castle-P30-640 85 castle-P30 1 --seconds 480 --budgets 1/4 1/8 --methods abcd $two_seeds
     trained budgets/bonsai-640 75 bonsai 1 --seconds 720 --budgets 1/4 1/8 --methods abcd
     for scene in castle-P30 fox caliterra; do
         trained equal-time/$scene 6 $scene 4 --seconds 60 --methods abcd-monolithic abcd --blocks 8 $two_seeds
